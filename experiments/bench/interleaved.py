@@ -1,0 +1,72 @@
+"""Run several systems over the same scans so that a noisy machine's ups and downs hit all of them alike."""
+
+import gc
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from datasets import Dataset
+from systems import Pose, System
+
+_PAUSE_S = 0.005
+"""Before each timed call: lets the thread pool of the system that ran before stop spinning."""
+
+
+@dataclass
+class Record:
+    """What one system did on one dataset."""
+
+    milliseconds: list[list[float]] = field(default_factory=list)
+    """Per pass, per scan."""
+    poses: list[list[Pose]] = field(default_factory=list)
+    """Per pass, T_world_lidar per scan."""
+
+
+def run(
+    dataset: Dataset, factories: dict[str, Callable[[], System]], repeats: int, by_scan: bool
+) -> dict[str, Record]:
+    """Run every system ``repeats`` times over the dataset.
+
+    Args:
+        dataset: decoded scans.
+        factories: name to maker of a fresh system.
+        repeats: passes.
+        by_scan: take turns scan by scan, else pass by pass; who begins rotates either way.
+
+    Returns:
+        Times and poses per system; what is done only once (compilation) is not in the times.
+    """
+    records = {name: Record() for name in factories}
+    for factory in factories.values():
+        factory().warm_up(dataset.scans)
+    for turn in range(repeats):
+        order = _rotated(list(factories), turn)
+        for group in [order] if by_scan else [[name] for name in order]:
+            _pass(dataset, {name: factories[name]() for name in group}, records)
+    return records
+
+
+def _pass(dataset: Dataset, systems: dict[str, System], records: dict[str, Record]) -> None:
+    for name in systems:
+        records[name].milliseconds.append([])
+        records[name].poses.append([])
+    gc.collect()
+    gc.disable()
+    try:
+        for number, scan in enumerate(dataset.scans):
+            for name in _rotated(list(systems), number):
+                prepared = systems[name].prepare(scan)
+                time.sleep(_PAUSE_S)
+                begin = time.perf_counter()
+                pose = systems[name].register(prepared)
+                spent = time.perf_counter() - begin
+                records[name].milliseconds[-1].append(1e3 * spent)
+                records[name].poses[-1].append(np.array(pose, np.float64))
+    finally:
+        gc.enable()
+
+
+def _rotated(names: list[str], by: int) -> list[str]:
+    by %= len(names)
+    return names[by:] + names[:by]

@@ -1,0 +1,93 @@
+"""Errors of a trajectory against what is known about a recording, every pose at its own instant."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from lio_jax.data.trajectory import Trajectory
+from lio_jax.evaluation.alignment import align
+from lio_jax.evaluation.association import match_by_time
+from lio_jax.evaluation.trajectory_error import absolute_error, relative_error
+
+_WINDOWS = (1, 10)
+"""Scans between the two poses of a pair, against an INS."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What is true about a recording."""
+
+    kind: str
+    """poses: good poses; ins: good over short distances only; standing: the vehicle does not move."""
+    trajectory: Trajectory
+    """T_world_lidar."""
+
+
+def score(estimate: Trajectory, reference: Reference) -> dict[str, float]:
+    """Return the errors that make sense for this kind of reference.
+
+    Args:
+        estimate: T_world_lidar, stamped with the instants its poses refer to.
+        reference: of the same lidar.
+
+    Returns:
+        Name (with its unit as the last part) to value.
+    """
+    matched = match_by_time(estimate, reference.trajectory)
+    if reference.kind == "poses":
+        return _pose_errors(matched.estimate, matched.reference)
+    if reference.kind == "standing":
+        return _standing_errors(matched.estimate)
+    errors: dict[str, float] = {}
+    for window in _WINDOWS:
+        if window < len(matched):
+            errors |= _window_errors(matched.estimate, matched.reference, window)
+    return errors
+
+
+def _pose_errors(estimate: Trajectory, reference: Trajectory) -> dict[str, float]:
+    absolute = absolute_error(estimate, reference, align(estimate.poses, reference.poses))
+    relative = relative_error(estimate, reference)
+    errors = {"ate_m": absolute.rmse}
+    if relative is not None:
+        errors |= {"rpe_m": relative.rmse, "rpe_deg": float(np.rad2deg(relative.rotation_rmse))}
+    return errors
+
+
+def _standing_errors(estimate: Trajectory) -> dict[str, float]:
+    moved = np.linalg.inv(estimate.poses[0]) @ estimate.poses
+    distance = 100 * np.linalg.norm(moved[:, :3, 3], axis=1)
+    angle = _angles_deg(moved)
+    return {
+        "moved_cm": float(distance[-1]),
+        "moved_deg": float(angle[-1]),
+        "moved_max_cm": float(distance.max()),
+        "moved_max_deg": float(angle.max()),
+    }
+
+
+def _window_errors(estimate: Trajectory, reference: Trajectory, window: int) -> dict[str, float]:
+    ours, true = _motions(estimate, window), _motions(reference, window)
+    distance = np.linalg.norm(ours[:, :3, 3], axis=1) - np.linalg.norm(true[:, :3, 3], axis=1)
+    # beside the length: jitter to the sides shows here, and so does a constant error of the INS
+    # heading, the same for every system (on drive 0005 it is some 2 deg off the direction of travel)
+    translation = np.linalg.norm(ours[:, :3, 3] - true[:, :3, 3], axis=1)
+    return {
+        f"distance{window}_m": _rmse(distance),
+        f"translation{window}_m": _rmse(translation),
+        f"rotation{window}_deg": _rmse(_angles_deg(np.linalg.inv(true) @ ours)),
+    }
+
+
+def _motions(trajectory: Trajectory, window: int) -> NDArray[np.float64]:
+    return np.linalg.inv(trajectory.poses[:-window]) @ trajectory.poses[window:]
+
+
+def _angles_deg(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.rad2deg(Rotation.from_matrix(poses[:, :3, :3]).magnitude())
+
+
+def _rmse(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,122 @@
+"""The systems under comparison behind one small protocol: peers with the settings their authors recommend."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.data.sequence import LidarScan
+
+Pose = NDArray[np.float64]
+
+
+class System(Protocol):
+    """One odometry run; a fresh instance starts at the identity."""
+
+    name: ClassVar[str]
+    instant: ClassVar[float]
+    """Which instant of a sweep its poses refer to: 0 the start, 1 the end."""
+    instant_reason: ClassVar[str]
+    """One sentence on why."""
+
+    def warm_up(self, scans: list[LidarScan]) -> None:
+        """Do what only has to be done once (compile, start threads); this instance is thrown away after."""
+        ...
+
+    def prepare(self, scan: LidarScan) -> Any:
+        """Return what the system's own reader would hand over; not timed, it counts as decoding."""
+        ...
+
+    def register(self, prepared: Any) -> Pose:
+        """Return T_world_lidar (4, 4) on the host; timed."""
+        ...
+
+
+class KissIcp:
+    """KISS-ICP with its defaults; deskewing where the scan has times."""
+
+    name: ClassVar[str] = "kiss-icp"
+    instant: ClassVar[float] = 1.0
+    instant_reason: ClassVar[str] = "1.3 deskews every point to the time of the scan's last one"
+
+    def __init__(self, threads: int) -> None:
+        from kiss_icp.config.parser import load_config
+        from kiss_icp.kiss_icp import KissICP
+
+        config = load_config(None)
+        config.registration.max_num_threads = threads
+        self._odometry = KissICP(config)
+
+    def warm_up(self, scans: list[LidarScan]) -> None:
+        for scan in scans[:2]:
+            self.register(self.prepare(scan))
+
+    def prepare(self, scan: LidarScan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        # times are normalised by their extent, and one of zero aborts the process; no times: no deskewing
+        has_times = scan.duration > 0 and np.ptp(scan.time) > 0
+        times = scan.time.astype(np.float64) if has_times else np.empty(0)
+        return scan.points.astype(np.float64), times
+
+    def register(self, prepared: tuple[NDArray[np.float64], NDArray[np.float64]]) -> Pose:
+        self._odometry.register_frame(*prepared)
+        pose: Pose = self._odometry.last_pose
+        return pose
+
+
+class KissIcpNoDeskew(KissIcp):
+    """KISS-ICP without deskewing: at low speed its deskewing can feed jitter of one pose into the next."""
+
+    name: ClassVar[str] = "kiss-icp-no-deskew"
+    instant: ClassVar[float] = 0.5
+    instant_reason: ClassVar[str] = (
+        "no deskewing: a moving sensor's points fit best at the middle of the scan"
+    )
+
+    def prepare(self, scan: LidarScan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return scan.points.astype(np.float64), np.empty(0)
+
+
+class SmallGicp:
+    """small_gicp's scan-to-model odometry against a Gaussian voxel map, its own example's settings."""
+
+    name: ClassVar[str] = "small_gicp"
+    instant: ClassVar[float] = 0.5
+    instant_reason: ClassVar[str] = (
+        "no deskewing: a moving sensor's points fit best at the middle of the scan"
+    )
+
+    def __init__(self, threads: int) -> None:
+        import small_gicp
+
+        self._library = small_gicp
+        self._threads = threads
+        self._map = small_gicp.GaussianVoxelMap(1.0)
+        self._map.set_lru(horizon=100, clear_cycle=10)
+        self._pose = np.eye(4)
+        self._motion = np.eye(4)
+
+    def warm_up(self, scans: list[LidarScan]) -> None:
+        for scan in scans[:2]:
+            self.register(self.prepare(scan))
+
+    def prepare(self, scan: LidarScan) -> NDArray[np.float64]:
+        return scan.points.astype(np.float64)
+
+    def register(self, prepared: NDArray[np.float64]) -> Pose:
+        cloud, _ = self._library.preprocess_points(prepared, 0.25, num_threads=self._threads)
+        if self._map.size() == 0:
+            self._map.insert(cloud)
+            return self._pose
+        guess = self._pose @ self._motion
+        pose = self._library.align(self._map, cloud, guess, num_threads=self._threads).T_target_source
+        self._motion = np.linalg.inv(self._pose) @ pose
+        self._pose = pose
+        self._map.insert(cloud, pose)
+        return self._pose
+
+
+PEERS: dict[str, Callable[[int], System]] = {
+    system.name: system for system in (KissIcp, KissIcpNoDeskew, SmallGicp)
+}
+"""Name to factory: ``factory(threads)``."""

@@ -1,0 +1,1 @@
+"""What the command line does, one module each: compose the package's parts and print."""

@@ -1,0 +1,208 @@
+"""``lio-jax run``: estimate a recording's trajectory and map, compare with truth, draw."""
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from lio_jax.commands.runtime import say
+from lio_jax.core.errors import LioJaxError, UsageError
+from lio_jax.core.settings import Settings, load_settings, with_overrides
+from lio_jax.data.open import open_sequence
+from lio_jax.data.sequence import Sequence
+from lio_jax.data.trajectory import Trajectory
+from lio_jax.recipes import recipe_named
+from lio_jax.run.folder import prepare_folder, write_json
+from lio_jax.run.run import Observer, RunResult, run_sequence, settings_for
+from lio_jax.run.track import Tracked
+from lio_jax.viz.recording import Recording
+
+
+def resolve_settings(recipe: str, assignments: tuple[str, ...]) -> Settings:
+    """Return the settings of a recipe name or settings file, with ``--set`` applied.
+
+    Raises:
+        UsageError: unknown recipe, unreadable file, unknown key or impossible value.
+    """
+    is_file = recipe.endswith((".yaml", ".yml"))
+    settings = load_settings(Path(recipe)) if is_file else Settings(recipe=recipe)
+    recipe_named(settings.recipe)
+    return with_overrides(settings, assignments)
+
+
+def run(
+    data: Path,
+    recipe: str,
+    assignments: tuple[str, ...],
+    out: Path,
+    start: int,
+    scans: int | None,
+    gt: Path | None,
+    overwrite: bool,
+) -> None:
+    """Run one recording from the command line."""
+    if start < 0 or (scans is not None and scans < 1):
+        raise UsageError(f"--start must be 0 or more and --scans 1 or more, not {start} and {scans}.")
+    settings = resolve_settings(recipe, assignments)
+    sequence = open_sequence(data, settings.config.data)
+    truth = _truth(sequence, gt)
+    run_and_report(sequence, settings, out, start, scans, truth, overwrite)
+
+
+def run_and_report(
+    sequence: Sequence,
+    settings: Settings,
+    out: Path,
+    start: int,
+    count: int | None,
+    truth: Trajectory | None,
+    overwrite: bool,
+) -> RunResult:
+    """Run a recording into a folder, evaluate against truth, draw, and say what came out.
+
+    Raises:
+        LioJaxError: nothing could be read, or the run ended early; what was computed is written.
+    """
+    settings, notes = settings_for(sequence, settings)
+    prepare_folder(out, overwrite)
+    info = sequence.info
+    for note in (*info.notes, *notes):
+        say(f"note: {note}")
+    total = max(0, info.scan_count - start) if count is None else min(count, max(0, info.scan_count - start))
+    with ExitStack() as stack:
+        observers: list[Observer] = []
+        recording = None
+        if settings.config.output.recording:
+            recording = stack.enter_context(Recording(out / "recording.rrd", total))
+            observers.append(RecordingObserver(recording, settings.config.lidar.insertion_points))
+        bar = stack.enter_context(tqdm(total=total, unit="scan", disable=None, leave=False))
+        observers.append(lambda tracked, scan_ms: _advance(bar))
+        result = run_sequence(sequence, settings, out, start, count, observers)
+        if recording and result.map_points is not None:
+            recording.log_map(result.map_points)
+        if recording and truth is not None:
+            recording.log_truth(_in_world_of(result.trajectory, truth).positions)
+    evaluation_text = _finish(result, truth, settings, out, info.name)
+    for warning in sequence.warnings_so_far:
+        say(f"warning: {warning}")
+    for failure in result.metrics["failures"][:_FAILURES_SHOWN]:
+        say(f"warning: {failure['message']}")
+    if (hidden := len(result.metrics["failures"]) - _FAILURES_SHOWN) > 0:
+        say(f"warning: {hidden} more of these; metrics.json lists them all.")
+    print(_summary(result, out), end="\n\n" if evaluation_text else "\n")
+    if evaluation_text:
+        print(evaluation_text)
+    _raise_if_interrupted(result, out)
+    return result
+
+
+_FAILURES_SHOWN = 5
+
+
+class RecordingObserver:
+    """Writes every scan, thinned, into a recording."""
+
+    def __init__(self, recording: Recording, capacity: int) -> None:
+        self._recording = recording
+        self._stride = max(1, capacity // _RECORDED_POINTS)
+
+    def __call__(self, tracked: Tracked, scan_ms: float) -> None:
+        """Log the motion-compensated scan at its pose."""
+        output, registration = tracked.output, tracked.output.registration
+        T_world_lidar = tracked.T_world_imu @ np.asarray(tracked.nav.T_imu_lidar.as_matrix())
+        mask = np.asarray(output.points_mask)[:: self._stride]
+        points = np.asarray(output.points)[:: self._stride][mask]
+        offset = np.asarray(output.origin) - T_world_lidar[:3, 3]
+        in_lidar = ((points + offset) @ T_world_lidar[:3, :3]).astype(np.float32)
+        self._recording.log_scan(tracked.index, tracked.stamp_ns, in_lidar, T_world_lidar)
+        self._recording.log_metrics(
+            tracked.index,
+            tracked.stamp_ns,
+            {
+                "scan_ms": scan_ms,
+                "matches": float(registration.matches),
+                "rmse_m": float(registration.rmse),
+                "iterations": float(registration.iterations),
+            },
+        )
+
+
+_RECORDED_POINTS = 5000
+
+
+def _advance(bar: Any) -> None:
+    bar.update()
+
+
+def _truth(sequence: Sequence, gt: Path | None) -> Trajectory | None:
+    if gt is None:
+        return sequence.truth()
+    from lio_jax.evaluation.load import load_trajectory
+
+    loaded = load_trajectory(gt)
+    if not loaded.stamped:
+        raise UsageError(f"{gt}: has no time stamps; give a TUM file, or KITTI poses beside their times.txt.")
+    return loaded.trajectory
+
+
+def _finish(result: RunResult, truth: Trajectory | None, settings: Settings, out: Path, name: str) -> str:
+    """Add the errors against truth to metrics.json, draw, and return the errors as a table."""
+    text = ""
+    if truth is not None:
+        from lio_jax.evaluation.evaluate import evaluate
+        from lio_jax.evaluation.report import format_evaluation
+
+        try:
+            evaluation = evaluate(result.trajectory, truth)
+        except LioJaxError as error:
+            say(f"warning: no comparison with the truth: {error}")
+        else:
+            result.metrics |= evaluation.as_dict()
+            write_json(out / "metrics.json", result.metrics)
+            text = format_evaluation(evaluation)
+    if settings.config.output.plot:
+        from lio_jax.viz.plot import plot_timings, plot_trajectory
+
+        plot_trajectory(out / "trajectory.png", result.trajectory, truth, name)
+        plot_timings(out / "timings.png", {k: v for k, v in result.stage_ms.items() if v})
+    return text
+
+
+def _in_world_of(estimate: Trajectory, truth: Trajectory) -> Trajectory:
+    """Move the truth so that it agrees with the estimate at the first instant both have."""
+    common = truth.at(estimate.stamp_ns)
+    if not len(common):
+        return truth
+    first = int(np.searchsorted(estimate.stamp_ns, common.stamp_ns[0]))
+    T_estimate_truth = estimate.poses[first] @ np.linalg.inv(common.poses[0])
+    return Trajectory(truth.stamp_ns, T_estimate_truth @ truth.poses)
+
+
+def _summary(result: RunResult, out: Path) -> str:
+    metrics = result.metrics
+    total = metrics["scan_ms"]["total"]
+    steps = np.linalg.norm(np.diff(result.trajectory.positions, axis=0), axis=1)
+    return "\n".join(
+        [
+            f"scans      {metrics['scans']}  ({steps.sum():.2f} m travelled)",
+            f"per scan   {total['median']:.1f} ms median, {total['p95']:.1f} ms p95",
+            f"compile    {metrics['compile_s']:.2f} s",
+            f"wall       {metrics['wall_s']:.1f} s",
+            f"memory     {metrics['peak_rss_mb']:.0f} MiB peak",
+            f"results    {out}",
+        ]
+    )
+
+
+def _raise_if_interrupted(result: RunResult, out: Path) -> None:
+    error = result.interruption
+    if error is None:
+        return
+    done = f"the first {result.metrics['scans']} scans are in {out}"
+    if isinstance(error, KeyboardInterrupt):
+        raise LioJaxError(f"interrupted; {done}.")
+    if isinstance(error, LioJaxError):
+        raise LioJaxError(f"{error} The run ended early; {done}.")
+    raise error

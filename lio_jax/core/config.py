@@ -1,0 +1,112 @@
+"""Static settings: what shapes arrays or chooses code. Frozen and hashable, so that jit can key on them.
+
+Everything that is a number to be tuned lives in :mod:`lio_jax.core.params` instead.
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """How a recording is read; "auto" or an empty string means: recognised from the data, and said."""
+
+    lidar_topic: str = ""
+    """Bag topic of the point clouds; empty: the one with most messages."""
+    imu_topic: str = ""
+    """Bag topic of the inertial samples; empty: the one with most messages."""
+    gps_topic: str = ""
+    """Bag topic of NavSatFix or Odometry used as GPS; empty: NavSatFix, or an Odometry named gps, gnss or rtk."""
+    time_field: str = ""
+    """Name of the per-point time field; empty: t, time, timestamp, time_stamp, offset_time or timeOffset."""
+    time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
+    """Unit of the per-point time field."""
+    time_reference: Literal["auto", "relative", "absolute"] = "auto"
+    """Whether per-point times count from the scan or from the epoch."""
+    stamp_at: Literal["auto", "start", "end"] = "auto"
+    """Which end of the scan the message's header stamp marks."""
+    accel_unit: Literal["auto", "m/s^2", "g"] = "auto"
+    """Unit of the accelerometer."""
+    compensated: Literal["auto", "yes", "no"] = "auto"
+    """Whether the recording's points are already motion compensated (KITTI odometry: yes)."""
+    vertical_correction_deg: float = 0.205
+    """Correction of the HDL-64E's elevation angles, applied to KITTI odometry scans only, deg."""
+    beams: int = 0
+    """Number of beams for ring reconstruction where the recording holds no ring; 0: 16, 32 or 64 by the data."""
+    scan_period: float = 0.1
+    """Duration of one sweep where it cannot be read from the data, s."""
+    prefetch: int = 3
+    """Number of scans decoded ahead on a thread."""
+
+
+@dataclass(frozen=True)
+class LidarConfig:
+    """Capacities of the scan's arrays."""
+
+    buckets: tuple[int, ...] = (4096, 8192, 16384, 32768, 65536, 98304, 131072, 196608, 262144)
+    """Padded scan sizes; a scan takes the smallest that holds it, a larger scan is thinned evenly to the last."""
+    registration_points: int = 4096
+    """Capacity of the downsampled scan that is registered."""
+    insertion_points: int = 16384
+    """Capacity of the downsampled scan that is written into the map."""
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """Capacity of the voxel map."""
+
+    capacity: int = 131072
+    """Number of voxel slots, a power of two."""
+
+
+@dataclass(frozen=True)
+class RegistrationConfig:
+    """Bounds of the scan-to-map solve."""
+
+    max_iterations: int = 60
+    """Gauss-Newton steps at most."""
+
+
+@dataclass(frozen=True)
+class OutputConfig:
+    """Which of the optional files a run folder gets."""
+
+    map: bool = True
+    """Write map.pcd."""
+    recording: bool = True
+    """Write recording.rrd."""
+    plot: bool = True
+    """Write trajectory.png and timings.png."""
+    keyframe_distance: float = 1.0
+    """A scan this far from the last keyframe becomes one, m."""
+    keyframe_angle: float = 0.2
+    """A scan turned this much from the last keyframe becomes one, rad."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """All static settings of a run."""
+
+    data: DataConfig = field(default_factory=DataConfig)
+    lidar: LidarConfig = field(default_factory=LidarConfig)
+    map: MapConfig = field(default_factory=MapConfig)
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    output: OutputConfig = field(default_factory=OutputConfig)
+
+
+_MAY_BE_ZERO = {"config.data.beams", "config.data.prefetch"}
+
+
+def invalid_config(path: str, value: object) -> str:
+    """Return why a setting's value is impossible ("must be ..."), or nothing if it is possible."""
+    if path == "config.map.capacity" and (not isinstance(value, int) or value < 2 or value & (value - 1)):
+        return "must be a power of two"
+    if path == "config.lidar.buckets" and (sorted(set(value)) != list(value) or value[0] < 1):  # type: ignore
+        return "must be positive sizes in ascending order"
+    if path == "config.data.vertical_correction_deg":
+        return ""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if path in _MAY_BE_ZERO:
+            return "" if value >= 0 else "must not be negative"
+        return "" if value > 0 else "must be greater than zero"
+    return ""

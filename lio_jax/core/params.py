@@ -1,0 +1,167 @@
+"""Traced parameters: every number that may be tuned, as a pytree of scalars.
+
+Changing a leaf recompiles nothing, leaves batch under vmap. What shapes arrays lives in
+:mod:`lio_jax.core.config`.
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from lio_jax.core.types import state_dtype
+
+Scalar = Float[Array, ""]
+
+
+class LidarParams(eqx.Module):
+    """The sensor's measurement model."""
+
+    range_sigma: Scalar
+    """Standard deviation of a point against the map's surface, m."""
+    min_range: Scalar
+    """Nearer points are dropped, m."""
+    max_range: Scalar
+    """Farther points are dropped, m."""
+
+
+class MapParams(eqx.Module):
+    """The voxel map."""
+
+    voxel_size: Scalar
+    """Edge length of a voxel, m."""
+    point_spacing: Scalar
+    """The scan is thinned to one point per cube of this edge before it enters the map, m."""
+    min_points: Scalar
+    """Points a voxel needs before scans are matched against it."""
+    reach: Scalar
+    """Voxels farther than this from the sensor may be forgotten, m."""
+
+
+class RegistrationParams(eqx.Module):
+    """The scan-to-map solve."""
+
+    point_spacing: Scalar
+    """The scan is thinned to one point per cube of this edge before it is matched, m."""
+    kernel: Scalar
+    """Scale of the Geman-McClure kernel, m."""
+    rotation_tolerance: Scalar
+    """The solve has converged when a step turns less than this, rad ..."""
+    translation_tolerance: Scalar
+    """... and moves less than this, m."""
+    degeneracy_ratio: Scalar
+    """A direction with less than this fraction of the strongest direction's information is degenerate."""
+    min_matches: Scalar
+    """Matched points below which a scan counts as lost."""
+
+
+class MotionParams(eqx.Module):
+    """The constant-velocity prediction between scans."""
+
+    initial_error: Scalar
+    """How far off the prediction may be before any velocity is known, m: it opens the robust kernel."""
+    error_decay: Scalar
+    """Fraction of the last expected prediction error that is kept when predictions turn out better, 0 to 1."""
+
+
+class ExtrinsicsParams(eqx.Module):
+    """T_imu_lidar."""
+
+    rotation: Float[Array, "4"]
+    """Quaternion xyzw."""
+    translation: Float[Array, "3"]
+    """Position of the lidar in the IMU frame, m."""
+
+    def T_imu_lidar(self) -> jaxlie.SE3:
+        """Return the pose of the lidar in the IMU frame."""
+        return jaxlie.SE3(
+            jnp.concatenate([self.rotation[jnp.array([3, 0, 1, 2])], self.translation])
+        ).normalize()
+
+
+class Params(eqx.Module):
+    """All traced parameters of a recipe."""
+
+    lidar: LidarParams
+    map: MapParams
+    registration: RegistrationParams
+    motion: MotionParams
+    extrinsics: ExtrinsicsParams
+
+
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "lidar": {"range_sigma": 0.045, "min_range": 2.0, "max_range": 100.0},
+    "map": {"voxel_size": 1.2, "point_spacing": 0.3, "min_points": 3.0, "reach": 120.0},
+    "registration": {
+        "point_spacing": 0.7,
+        "kernel": 0.2,
+        "rotation_tolerance": 1e-4,
+        "translation_tolerance": 1e-3,
+        "degeneracy_ratio": 1e-3,
+        "min_matches": 50.0,
+    },
+    "motion": {"initial_error": 2.0, "error_decay": 0.5},
+    "extrinsics": {"rotation": [0.0, 0.0, 0.0, 1.0], "translation": [0.0, 0.0, 0.0]},
+}
+"""Values of the default recipe in the units of the leaves above."""
+
+_SECTIONS = {f.name: f.type for f in dataclasses.fields(Params)}
+
+
+def params_from_values(values: dict[str, dict[str, Any]]) -> Params:
+    """Build the pytree from nested plain numbers, every leaf an array of the navigation state's dtype."""
+    dtype = state_dtype()
+    return Params(
+        **{
+            section: kind(**{key: jnp.asarray(value, dtype) for key, value in values[section].items()})
+            for section, kind in _SECTIONS.items()
+        }
+    )
+
+
+def default_params() -> Params:
+    """Return the default recipe's parameters."""
+    return params_from_values(DEFAULTS)
+
+
+def values_from_params(params: Params) -> dict[str, dict[str, Any]]:
+    """Return nested plain numbers, the inverse of :func:`params_from_values`."""
+    return {
+        section: {
+            f.name: jax.device_get(getattr(getattr(params, section), f.name)).tolist()
+            for f in dataclasses.fields(kind)
+        }
+        for section, kind in _SECTIONS.items()
+    }
+
+
+_MAY_BE_ZERO = {
+    "lidar.min_range",
+    "motion.initial_error",
+    "registration.degeneracy_ratio",
+    "motion.error_decay",
+}
+_AT_MOST_ONE = {"motion.error_decay", "registration.degeneracy_ratio"}
+
+
+def invalid_value(path: str, value: Any) -> str:
+    """Return why a parameter's value is impossible ("must be ..."), or nothing if it is possible.
+
+    Args:
+        path: section and name, such as ``lidar.range_sigma``.
+        value: a finite number or a list of them.
+    """
+    if path == "extrinsics.translation":
+        return ""
+    if path == "extrinsics.rotation":
+        norm = sum(x * x for x in value) ** 0.5
+        return "" if abs(norm - 1) < 1e-3 else f"must be a unit quaternion x y z w (its norm is {norm:.4g})"
+    if path in _AT_MOST_ONE and value > 1:
+        return "must be at most 1"
+    if path in _MAY_BE_ZERO:
+        return "" if value >= 0 else "must not be negative"
+    return "" if value > 0 else "must be greater than zero"

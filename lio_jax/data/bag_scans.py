@@ -1,0 +1,163 @@
+"""From a point-cloud message to a LidarScan, after a look at the first messages of the topic."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.config import DataConfig
+from lio_jax.core.errors import LioJaxError
+from lio_jax.data import livox
+from lio_jax.data.bag_topics import Topic
+from lio_jax.data.point_time import PointTiming, TimeSample, recognise_point_time, scan_period, stamp_end
+from lio_jax.data.pointcloud2 import decode_pointcloud2
+from lio_jax.data.raw_cloud import RawCloud
+from lio_jax.data.reconstruct import azimuth_time, guess_beams, ring_from_elevation
+from lio_jax.data.sequence import LidarScan
+from lio_jax.data.trajectory import ns_to_seconds
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+_SCANS_LOOKED_AT = 8
+
+
+def decode_cloud(reader: "AnyReader", topic: Topic, raw: bytes, time_field: str, where: str) -> RawCloud:
+    """Decode one serialised message of ``topic``.
+
+    Raises:
+        LioJaxError: the topic's layout cannot be used.
+        ValueError: this one message is damaged.
+    """
+    if topic.type in livox.TYPES:
+        return livox.decode_custom_msg(raw, reader.is2)
+    try:
+        message: Any = reader.deserialize(raw, topic.type)
+    # The generated decoders raise struct, index, unicode or their own errors on damaged bytes.
+    except Exception as error:
+        raise ValueError(f"the message cannot be decoded: {error}") from error
+    return decode_pointcloud2(message, time_field=time_field, where=where)
+
+
+@dataclass(frozen=True)
+class ScanReading:
+    """How a topic's clouds become scans; the same for all of its scans."""
+
+    timing: PointTiming | None
+    """None where time is reconstructed from azimuth, or the points are motion compensated."""
+    stamp_at: Literal["start", "end"]
+    """Where the header stamp lies if ``timing`` is None."""
+    sweep: float
+    """Usual duration of a scan, s; 0 where points are motion compensated."""
+    beams: int
+    """For reconstruction; 0 where messages hold the ring."""
+    notes: tuple[str, ...]
+
+    def scan(self, cloud: RawCloud, name: str, warn: Callable[[str], None]) -> LidarScan:
+        """Place a decoded cloud in time and complete it.
+
+        Args:
+            cloud: decoded message.
+            name: how a warning calls the scan.
+            warn: called with one sentence for each problem.
+        """
+        start_ns, time, duration, keep = self._times(cloud, name, warn)
+        points, intensity, ring = cloud.points, cloud.intensity, cloud.ring
+        if ring is None:
+            ring = ring_from_elevation(points, self.beams)
+        if keep is not None:
+            points, intensity, ring = points[keep], intensity[keep], ring[keep]
+        if len(points) == 0:
+            warn(f"{name} ({ns_to_seconds(start_ns)} s) holds no points.")
+        return LidarScan(start_ns, points, time, ring, intensity, duration)
+
+    def _times(
+        self, cloud: RawCloud, name: str, warn: Callable[[str], None]
+    ) -> tuple[int, NDArray[np.float32], float, NDArray[np.bool_] | None]:
+        if self.timing is None or cloud.time is None or cloud.time_range is None:
+            at_end = self.stamp_at == "end" if self.timing is None else self.timing.anchor == "end"
+            start_ns = cloud.stamp_ns - round(self.sweep * 1e9) if at_end else cloud.stamp_ns
+            return start_ns, azimuth_time(cloud.points, self.sweep), self.sweep, None
+        low, high = cloud.time_range
+        time, keep = cloud.time, None
+        if (high - low) * self.timing.tick_ns * 1e-9 > 2.0 * self.sweep:
+            outliers = self.timing.outliers(time)
+            if outliers is not None:
+                keep = ~outliers
+                time = time[keep]
+                warn(f"{name}: {np.count_nonzero(outliers)} points with impossible times were dropped.")
+            if time.size:
+                low, high = time.min().item(), time.max().item()
+        return *self.timing.place(cloud.stamp_ns, time, low, high), keep
+
+
+def recognise_scans(
+    reader: "AnyReader",
+    topic: Topic,
+    messages: Iterable[tuple[Any, int, bytes]],
+    config: DataConfig,
+    where: str,
+) -> ScanReading:
+    """Settle how the topic's clouds are read from its first scans that hold points.
+
+    Args:
+        reader: open bag.
+        topic: of the point clouds.
+        messages: (connection, receipt ns, bytes) of the topic, in order.
+        config: overrides.
+        where: bag and topic, for errors.
+
+    Raises:
+        LioJaxError: the layout cannot be used, or no message can be decoded.
+    """
+    first: RawCloud | None = None
+    headers: list[int] = []
+    samples: list[TimeSample] = []
+    beams: list[int] = []
+    kind = reason = ""
+    for _, received_ns, raw in messages:
+        try:
+            cloud = decode_cloud(reader, topic, raw, config.time_field, where)
+        except ValueError as error:
+            reason = f" ({error})"
+            continue
+        if first is None or not len(first.points):
+            first = cloud
+        if not len(cloud.points):
+            continue
+        headers.append(cloud.stamp_ns)
+        if cloud.ring is None:
+            beams.append(config.beams or guess_beams(cloud.points))
+        low, high = cloud.time_range or (0, 0)
+        if cloud.time is not None:
+            kind = cloud.time.dtype.name
+        samples.append(TimeSample(cloud.stamp_ns, received_ns, low, high))
+        if len(headers) == _SCANS_LOOKED_AT:
+            break
+    if first is None:
+        raise LioJaxError(
+            f"{where}: no point cloud can be read{reason}; the recording is empty or damaged there."
+        )
+    chosen_beams = max(set(beams), key=beams.count) if beams else config.beams or 16
+    ring_note = _ring_note(first, chosen_beams)
+    if config.compensated == "yes":
+        time_note = "points are taken as motion compensated to the header stamp (config.data.compensated)"
+        return ScanReading(None, "start", 0.0, chosen_beams, (time_note, *ring_note))
+    timing = recognise_point_time(samples, first.time_field, kind, config) if kind else None
+    if timing is not None:
+        return ScanReading(timing, "start", timing.sweep, chosen_beams, (timing.note, *ring_note))
+    period = scan_period(headers, config.scan_period)
+    stamp_at, said = stamp_end(samples, period, config) if samples else ("start", "no points in any message")
+    missing = f"field {first.time_field!r} holds a single value" if first.time_field else "not recorded"
+    time_note = f"per-point time: {missing}, reconstructed from azimuth over {period:.4g} s a scan, {said}"
+    return ScanReading(None, stamp_at, period, chosen_beams, (time_note, *ring_note))
+
+
+def _ring_note(cloud: RawCloud, beams: int) -> tuple[str, ...]:
+    if cloud.ring is None:
+        return (f"ring: not recorded, reconstructed from elevation as of {beams} beams (config.data.beams)",)
+    if cloud.ring_source == "rows":
+        return ("ring: not recorded, taken from the rows of the organised cloud",)
+    return ()

@@ -1,0 +1,205 @@
+"""KITTI odometry sequences: compensated HDL-64E scans, camera stamps, camera poses.
+
+Format: Geiger, Lenz and Urtasun, "Are we ready for Autonomous Driving? The KITTI Vision Benchmark Suite",
+    2012.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.config import DataConfig
+from lio_jax.core.errors import LioJaxError
+from lio_jax.data.order import StampOrder
+from lio_jax.data.reconstruct import KITTI_START_AZIMUTH, azimuth_time
+from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
+from lio_jax.data.trajectory import Trajectory, read_kitti_poses, seconds_to_ns
+from lio_jax.data.velodyne_file import (
+    check_sizes,
+    hdl64_ring,
+    listed,
+    missing_numbers,
+    numbered_files,
+    read_returns,
+)
+from lio_jax.data.warning_log import WarningLog
+
+
+class KittiSequence:
+    """A folder ``sequences/NN`` with velodyne/*.bin, times.txt and calib.txt."""
+
+    def __init__(self, path: Path, config: DataConfig) -> None:
+        """Open ``path`` without decoding scans.
+
+        Raises:
+            LioJaxError: no scans, or a broken times.txt or calib.txt.
+        """
+        self._path = path
+        self._config = config
+        self._log = WarningLog()
+        self._notes = ["no IMU in KITTI odometry: the body frame is the lidar frame"]
+        files = numbered_files(path / "velodyne", [".bin"])
+        if not files:
+            raise LioJaxError(
+                f"{path / 'velodyne'}: holds no scans (NNNNNN.bin); give a complete sequence folder."
+            )
+        self._stamps = self._read_stamps(files)
+        self._compensated = config.compensated != "no"
+        self._files = self._usable(files)
+        self._note_points()
+        self._poses_path = next((p for p in self._pose_candidates() if p.is_file()), None)
+        self._T_cam_lidar = self._read_calibration()
+
+    @property
+    def info(self) -> SequenceInfo:
+        """Return what is known without decoding scans."""
+        return SequenceInfo(
+            name=f"kitti_{self._path.resolve().name}",
+            format="kitti_odometry",
+            path=str(self._path),
+            scan_count=len(self._files),
+            T_imu_lidar=np.eye(4),
+            sensor="Velodyne HDL-64E",
+            notes=tuple(self._notes),
+        )
+
+    @property
+    def warnings_so_far(self) -> tuple[str, ...]:
+        """Return one sentence for each problem met up to now."""
+        return self._log.sentences
+
+    def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
+        """Yield scans; compensated: duration 0; else they start half a sweep before the camera's stamp."""
+        stop = None if count is None else start + count
+        for number, path in self._files[start:stop]:
+            rows = read_returns(path, self._log.add)
+            if rows is not None:
+                yield self._scan(self._stamps[number], rows)
+
+    def imu(self) -> ImuData | None:
+        """Return None: the odometry benchmark holds no inertial data."""
+        return None
+
+    def gps(self) -> GpsData | None:
+        """Return None: the odometry benchmark holds no fixes."""
+        return None
+
+    def truth(self) -> Trajectory | None:
+        """Return T_world_lidar = (P_0 Tr)^-1 P_i Tr, the first identity; None without poses or calib.txt."""
+        if self._poses_path is None or self._T_cam_lidar is None:
+            return None
+        poses = read_kitti_poses(self._poses_path)
+        count = min(len(poses), len(self._stamps))
+        lidar = poses[:count] @ self._T_cam_lidar
+        return Trajectory(np.array(self._stamps[:count], np.int64), np.linalg.inv(lidar[0]) @ lidar)
+
+    def _scan(self, stamp_ns: int, rows: NDArray[np.float32]) -> LidarScan:
+        points = np.ascontiguousarray(rows[:, :3])
+        duration = 0.0 if self._compensated else self._config.scan_period
+        return LidarScan(
+            stamp_ns=stamp_ns - round(duration * 0.5e9),
+            points=raise_elevation(points, self._config.vertical_correction_deg),
+            time=azimuth_time(points, duration, start_azimuth=KITTI_START_AZIMUTH),
+            ring=hdl64_ring(points),
+            intensity=np.ascontiguousarray(rows[:, 3]),
+            duration=duration,
+        )
+
+    def _read_stamps(self, files: dict[int, Path]) -> list[int]:
+        path = self._path / "times.txt"
+        if not path.is_file():
+            period_ns = round(self._config.scan_period * 1e9)
+            self._notes.append(f"no times.txt: scans are taken to be {self._config.scan_period} s apart")
+            return [number * period_ns for number in range(max(files) + 1)]
+        stamps = []
+        for number, line in enumerate(path.read_text().split(), 1):
+            try:
+                stamps.append(seconds_to_ns(line))
+            except (ValueError, OverflowError):
+                raise LioJaxError(
+                    f"{path}: entry {number} ('{line[:40]}') is not a time in seconds; fix it."
+                ) from None
+        last = max(files)
+        if len(stamps) > last + 1:
+            self._notes.append(
+                f"a cut-out: times.txt has {len(stamps)} entries, the scans end at {last:06d}.bin"
+            )
+        return stamps
+
+    def _usable(self, files: dict[int, Path]) -> list[tuple[int, Path]]:
+        velodyne = self._path / "velodyne"
+        if missing := missing_numbers(files):
+            self._log.add(f"{velodyne}: scan(s) {listed(missing, 6)} are missing and were skipped.")
+        if untimed := [number for number in files if number >= len(self._stamps)]:
+            self._log.add(
+                f"{self._path / 'times.txt'}: ends before scan(s) {listed(untimed, 6)}; they were skipped."
+            )
+        check_sizes(files.values(), self._log.add)
+        order = StampOrder(self._log.add)
+        return [
+            (number, path)
+            for number, path in files.items()
+            if number < len(self._stamps) and order.accept(self._stamps[number], str(path))
+        ]
+
+    def _note_points(self) -> None:
+        if self._compensated:
+            self._notes.append("points are taken as already motion compensated (config.data.compensated)")
+        else:
+            self._notes.append(
+                "point times from azimuth, half a sweep before to half a sweep after the camera's stamp"
+            )
+        if correction := self._config.vertical_correction_deg:
+            self._notes.append(
+                f"elevation angles raised by {correction} deg (config.data.vertical_correction_deg)"
+            )
+
+    def _pose_candidates(self) -> list[Path]:
+        path = self._path.resolve()
+        return [path / "poses.txt", path.parent.parent / "poses" / f"{path.name}.txt"]
+
+    def _read_calibration(self) -> NDArray[np.float64] | None:
+        path = self._path / "calib.txt"
+        if not path.is_file():
+            if self._poses_path is not None:
+                self._notes.append(
+                    "no calib.txt: the camera's poses cannot be turned into the lidar's, no truth"
+                )
+            return None
+        for line in path.read_text().splitlines():
+            key, _, values = line.partition(":")
+            if key.strip() in ("Tr", "Tr_velo_to_cam"):
+                try:
+                    rows = np.array(values.split(), float).reshape(3, 4)
+                except ValueError:
+                    raise LioJaxError(
+                        f"{path}: '{key.strip()}' does not hold 12 numbers (3x4); fix it."
+                    ) from None
+                return np.vstack([rows, [0.0, 0.0, 0.0, 1.0]])
+        self._notes.append("calib.txt has no entry Tr (lidar to camera): no truth")
+        return None
+
+
+def raise_elevation(points: NDArray[np.float32], angle_deg: float) -> NDArray[np.float32]:
+    """Raise each point's elevation angle by ``angle_deg``: rotate it about cross(p, z).
+
+    KITTI's intrinsic calibration is off by about 0.205 deg (IMLS-SLAM, Deschaud 2018). A point straight above
+    or below has no such axis and stays.
+
+    Args:
+        points: (n, 3) m, lidar frame.
+        angle_deg: deg; 0 returns the points as they are.
+    """
+    if angle_deg == 0.0 or len(points) == 0:
+        return points
+    cosine, sine = np.float32(np.cos(np.radians(angle_deg))), np.float32(np.sin(np.radians(angle_deg)))
+    x, y, z = points.T
+    horizontal = np.sqrt(x * x + y * y)
+    has_axis = horizontal > 0
+    scale = cosine - sine * z / np.where(has_axis, horizontal, np.float32(1.0))
+    raised = np.stack([x * scale, y * scale, z * cosine + horizontal * sine], axis=1)
+    if not has_axis.all():
+        raised[~has_axis] = points[~has_axis]
+    return raised

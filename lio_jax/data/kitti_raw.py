@@ -1,0 +1,179 @@
+"""KITTI raw drives (``*_sync`` and ``*_extract``): raw HDL-64E sweeps with an OXTS INS.
+
+Format: Geiger, Lenz, Stiller and Urtasun, "Vision meets Robotics: The KITTI Dataset", 2013, and its devkit.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.config import DataConfig
+from lio_jax.core.errors import LioJaxError
+from lio_jax.data.order import StampOrder
+from lio_jax.data.oxts import OxtsPackets, read_oxts, read_timestamps
+from lio_jax.data.reconstruct import KITTI_START_AZIMUTH, azimuth_time
+from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
+from lio_jax.data.trajectory import Trajectory
+from lio_jax.data.velodyne_file import (
+    check_sizes,
+    hdl64_ring,
+    listed,
+    missing_numbers,
+    numbered_files,
+    read_returns,
+)
+from lio_jax.data.warning_log import WarningLog
+
+_LONGEST_SWEEP_S = 0.5
+
+
+@dataclass(frozen=True)
+class _Sweep:
+    path: Path
+    stamp_ns: int
+    duration: float
+
+
+class KittiRawSequence:
+    """A drive folder with velodyne_points/ and oxts/."""
+
+    def __init__(self, path: Path, config: DataConfig) -> None:
+        """Open ``path`` without decoding scans.
+
+        Raises:
+            LioJaxError: no scans, or a broken timestamp or calibration file.
+        """
+        self._path = path
+        self._config = config
+        self._log = WarningLog()
+        self._notes: list[str] = []
+        self._compensated = config.compensated == "yes"
+        velodyne = path / "velodyne_points"
+        files = numbered_files(velodyne / "data", [".bin", ".txt"]) if (velodyne / "data").is_dir() else {}
+        if not files:
+            raise LioJaxError(
+                f"{velodyne / 'data'}: holds no scans (NNNNNNNNNN.bin or .txt); give a complete drive."
+            )
+        self._sweeps = self._time_sweeps(velodyne, files)
+        self._T_imu_lidar = self._read_calibration()
+        self._notes.append(
+            "points are taken as already motion compensated (config.data.compensated)"
+            if self._compensated
+            else "point times from azimuth, clockwise from straight behind"
+        )
+
+    @property
+    def info(self) -> SequenceInfo:
+        """Return what is known without decoding scans."""
+        return SequenceInfo(
+            name=self._path.resolve().name,
+            format="kitti_raw",
+            path=str(self._path),
+            scan_count=len(self._sweeps),
+            T_imu_lidar=self._T_imu_lidar,
+            sensor="Velodyne HDL-64E",
+            notes=tuple(self._notes),
+        )
+
+    @property
+    def warnings_so_far(self) -> tuple[str, ...]:
+        """Return one sentence for each problem met up to now."""
+        return self._log.sentences
+
+    def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
+        """Yield scans, stamped at their start; all points at time 0 if config says they are compensated."""
+        stop = None if count is None else start + count
+        for sweep in self._sweeps[start:stop]:
+            rows = read_returns(sweep.path, self._log.add)
+            if rows is None:
+                continue
+            points = np.ascontiguousarray(rows[:, :3])
+            yield LidarScan(
+                stamp_ns=sweep.stamp_ns,
+                points=points,
+                time=azimuth_time(points, sweep.duration, start_azimuth=KITTI_START_AZIMUTH),
+                ring=hdl64_ring(points),
+                intensity=np.ascontiguousarray(rows[:, 3]),
+                duration=sweep.duration,
+            )
+
+    def imu(self) -> ImuData | None:
+        """Return the INS's accelerations and rates, body frame (10 Hz in sync drives, 100 Hz in extract)."""
+        return None if self._oxts is None else self._oxts.imu()
+
+    def gps(self) -> GpsData | None:
+        """Return the INS's positions in ENU around the first."""
+        return None if self._oxts is None else self._oxts.gps()
+
+    def truth(self) -> Trajectory | None:
+        """Return the INS's T_world_imu: level, first position at the origin, devkit's Mercator convention."""
+        return None if self._oxts is None else self._oxts.truth()
+
+    @cached_property
+    def _oxts(self) -> OxtsPackets | None:
+        return read_oxts(self._path / "oxts", self._log.add)
+
+    def _time_sweeps(self, velodyne: Path, files: dict[int, Path]) -> list[_Sweep]:
+        starts, durations = self._read_times(velodyne)
+        last = max(files)
+        if len(starts) > last + 1:
+            self._notes.append(f"a cut-out: {len(starts)} timestamps, the scans end at {files[last].name}")
+        if missing := missing_numbers(files):
+            self._log.add(f"{velodyne / 'data'}: scan(s) {listed(missing, 10)} are missing and were skipped.")
+        if untimed := [number for number in files if number >= len(starts)]:
+            self._log.add(
+                f"{velodyne}: the timestamps end before scan(s) {listed(untimed, 10)}; they were skipped."
+            )
+        check_sizes(files.values(), self._log.add)
+        order = StampOrder(self._log.add)
+        sweeps = []
+        for number, path in files.items():
+            if number >= len(starts) or not order.accept(int(starts[number]), str(path)):
+                continue
+            duration = float(durations[number])
+            if not 0.0 < duration < _LONGEST_SWEEP_S:
+                self._log.add(
+                    f"{path}: its sweep would last {duration:.3f} s by timestamps_end.txt; "
+                    f"config.data.scan_period ({self._config.scan_period} s) is used."
+                )
+                duration = self._config.scan_period
+            sweeps.append(_Sweep(path, int(starts[number]), 0.0 if self._compensated else duration))
+        return sweeps
+
+    def _read_times(self, velodyne: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the stamps of the sweeps' starts, ns, and their durations, s."""
+        period_ns = round(self._config.scan_period * 1e9)
+        if (velodyne / "timestamps_start.txt").is_file():
+            starts = read_timestamps(velodyne / "timestamps_start.txt")
+        else:
+            starts = read_timestamps(velodyne / "timestamps.txt") - period_ns // 2
+            self._notes.append(
+                "no timestamps_start.txt: sweeps start half a scan_period before timestamps.txt"
+            )
+        ends = starts + period_ns
+        if (velodyne / "timestamps_end.txt").is_file():
+            known = read_timestamps(velodyne / "timestamps_end.txt")[: len(starts)]
+            ends[: len(known)] = known
+        else:
+            self._notes.append(
+                f"no timestamps_end.txt: sweeps are taken to last {self._config.scan_period} s"
+            )
+        return starts, np.asarray((ends - starts) * 1e-9, np.float64)
+
+    def _read_calibration(self) -> NDArray[np.float64] | None:
+        path = self._path.resolve().parent / "calib_imu_to_velo.txt"
+        if not path.is_file():
+            self._notes.append("no calib_imu_to_velo.txt in the parent folder: the extrinsic is unknown")
+            return None
+        entries = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
+        T_lidar_imu = np.eye(4)
+        try:
+            T_lidar_imu[:3, :3] = np.array(entries["R"].split(), float).reshape(3, 3)
+            T_lidar_imu[:3, 3] = np.array(entries["T"].split(), float)
+            return np.asarray(np.linalg.inv(T_lidar_imu), np.float64)
+        except (KeyError, ValueError, np.linalg.LinAlgError):
+            raise LioJaxError(f"{path}: needs the entries R (9 numbers) and T (3 numbers); fix it.") from None

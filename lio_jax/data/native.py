@@ -1,0 +1,170 @@
+"""The package's own recording format: a folder with meta.yaml, scans/, imu.npz, gps.npz and truth.tum."""
+
+import zipfile
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from lio_jax.core.config import DataConfig
+from lio_jax.core.errors import LioJaxError
+from lio_jax.data.order import StampOrder
+from lio_jax.data.returns import valid_returns
+from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
+from lio_jax.data.trajectory import Trajectory, read_tum
+from lio_jax.data.velodyne_file import listed, missing_numbers, numbered_files
+from lio_jax.data.warning_log import WarningLog
+
+FORMAT_VERSION = 1
+"""Version written to and accepted from meta.yaml."""
+
+_UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+
+
+class NativeSequence:
+    """A folder written by :func:`lio_jax.data.native_writer.write_native`."""
+
+    def __init__(self, path: Path, config: DataConfig) -> None:
+        """Open ``path`` without decoding scans.
+
+        Raises:
+            LioJaxError: a broken meta.yaml, another format version, or no scans.
+        """
+        self._path = path
+        self._compensated = config.compensated == "yes"
+        self._log = WarningLog()
+        self._meta = _read_meta(path / "meta.yaml")
+        files = numbered_files(path / "scans", [".npz"]) if (path / "scans").is_dir() else {}
+        if not files:
+            raise LioJaxError(
+                f"{path / 'scans'}: holds no scans (NNNNNN.npz); give a complete native folder."
+            )
+        if missing := missing_numbers(files):
+            self._log.add(f"{path / 'scans'}: scan(s) {listed(missing, 6)} are missing and were skipped.")
+        self._files = list(files.values())
+
+    @property
+    def info(self) -> SequenceInfo:
+        """Return what is known without decoding scans."""
+        return SequenceInfo(
+            name=self._meta["name"] or self._path.resolve().name,
+            format="native",
+            path=str(self._path),
+            scan_count=len(self._files),
+            T_imu_lidar=self._meta["T_imu_lidar"],
+            sensor=self._meta["sensor"],
+            notes=("points are taken as already motion compensated (config.data.compensated)",)
+            if self._compensated
+            else (),
+        )
+
+    @property
+    def warnings_so_far(self) -> tuple[str, ...]:
+        """Return one sentence for each problem met up to now."""
+        return self._log.sentences
+
+    def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
+        """Yield scans by their numbers; unreadable and out-of-order ones are left out and reported."""
+        stop = None if count is None else start + count
+        order = StampOrder(self._log.add)
+        for path in self._files[start:stop]:
+            scan = self._load_scan(path)
+            if scan is not None and order.accept(scan.stamp_ns, str(path)):
+                yield scan
+
+    def imu(self) -> ImuData | None:
+        """Return imu.npz, or None where there is none."""
+        arrays = self._arrays("imu.npz", ("stamp_ns", "gyro", "accel"))
+        if arrays is None:
+            return None
+        return ImuData(arrays["stamp_ns"], arrays["gyro"], arrays["accel"], arrays.get("orientation"))
+
+    def gps(self) -> GpsData | None:
+        """Return gps.npz, or None where there is none."""
+        arrays = self._arrays("gps.npz", ("stamp_ns", "position", "covariance", "origin"))
+        if arrays is None:
+            return None
+        latitude, longitude, altitude = (float(value) for value in arrays["origin"])
+        return GpsData(
+            arrays["stamp_ns"], arrays["position"], arrays["covariance"], (latitude, longitude, altitude)
+        )
+
+    def truth(self) -> Trajectory | None:
+        """Return truth.tum (T_world_imu), or None where there is none."""
+        return self._truth
+
+    def truth_arrays(self) -> dict[str, NDArray[Any]]:
+        """Return what truth.npz holds (true noise, biases); empty where there is none."""
+        return self._arrays("truth.npz", ()) or {}
+
+    @cached_property
+    def _truth(self) -> Trajectory | None:
+        path = self._path / "truth.tum"
+        return read_tum(path) if path.is_file() else None
+
+    def _load_scan(self, path: Path) -> LidarScan | None:
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {key: file[key] for key in file.files}
+            return _scan_of(arrays, self._compensated)
+        except _UNREADABLE as error:
+            self._log.add(f"{path}: cannot be read ({error}), the scan was skipped.")
+            return None
+
+    def _arrays(self, name: str, required: tuple[str, ...]) -> dict[str, NDArray[Any]] | None:
+        path = self._path / name
+        if not path.is_file():
+            return None
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {key: file[key] for key in file.files}
+        except _UNREADABLE as error:
+            raise LioJaxError(f"{path}: cannot be read ({error}); write the folder again.") from None
+        if missing := [key for key in required if key not in arrays]:
+            raise LioJaxError(f"{path}: lacks {', '.join(missing)}; write the folder again.")
+        return arrays
+
+
+def _scan_of(arrays: dict[str, NDArray[Any]], compensated: bool) -> LidarScan:
+    points = arrays["points"].astype(np.float32, copy=False)
+    count = len(points)
+    time, ring, intensity = arrays["time"], arrays["ring"], arrays["intensity"]
+    if points.shape != (count, 3) or not len(time) == len(ring) == len(intensity) == count:
+        raise ValueError("points, time, ring and intensity differ in length")
+    duration = float(arrays.get("duration", time.max() if count else 0.0))
+    valid = valid_returns(points)
+    if not valid.all():
+        points, time, ring, intensity = points[valid], time[valid], ring[valid], intensity[valid]
+    return LidarScan(
+        stamp_ns=int(arrays["stamp_ns"]),
+        points=points,
+        time=np.zeros(len(points), np.float32) if compensated else time.astype(np.float32, copy=False),
+        ring=ring.astype(np.int32, copy=False),
+        intensity=intensity.astype(np.float32, copy=False),
+        duration=0.0 if compensated else duration,
+    )
+
+
+def _read_meta(path: Path) -> dict[str, Any]:
+    try:
+        meta = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise LioJaxError(f"{path}: cannot be read as YAML ({str(error).splitlines()[0]}); fix it.") from None
+    if not isinstance(meta, dict) or meta.get("format_version") != FORMAT_VERSION:
+        found = meta.get("format_version") if isinstance(meta, dict) else None
+        raise LioJaxError(f"{path}: format_version is {found}, this program reads {FORMAT_VERSION}.")
+    extrinsic = meta.get("T_imu_lidar")
+    if extrinsic is not None:
+        try:
+            extrinsic = np.array(extrinsic, float).reshape(4, 4)
+        except (TypeError, ValueError):
+            raise LioJaxError(f"{path}: T_imu_lidar is not four rows of four numbers; fix it.") from None
+    return {
+        "T_imu_lidar": extrinsic,
+        "sensor": str(meta.get("sensor") or ""),
+        "name": str(meta.get("name") or ""),
+    }

@@ -1,0 +1,216 @@
+"""When each point was measured: unit, reference and anchor of its time, recognised from the first scans.
+
+Every recording answers three questions in its own way; all are settled by magnitudes, and each answer can be
+overridden in :class:`~lio_jax.core.config.DataConfig`:
+
+- Absolute or relative? Absolute times advance from scan to scan as the header stamps do; relative ones start
+  anew.
+- Which unit? The one in which that advance equals the header's, or else in which a scan's spread comes
+  nearest to the time between scans (units are a factor of 1000 apart, so there is no close call).
+- What does the header stamp mark? Absolute times on the header's clock place the scan by themselves. Relative
+  times down to below zero count from the header stamp. Relative times from zero fit a stamp at either end: a
+  message cannot be received before its scan ended, so a receipt sooner after the stamp than the scan lasts
+  says "end"; without such evidence "start" is assumed, as most drivers do it, and the note says so.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.config import DataConfig
+
+TICK_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+
+_CLEARLY_RECEIVED_LATER = 0.002
+"""s; bags written by a converter have receipt equal to the stamp, which tells nothing."""
+_LONGEST_LATENCY = 5.0
+"""s; beyond this the recorder's clock is another one than the sensor's."""
+
+
+@dataclass(frozen=True)
+class TimeSample:
+    """What one scan tells about its times."""
+
+    header_ns: int
+    received_ns: int
+    """When the recorder got the message, ns."""
+    low: float | int
+    """Least per-point time, ticks."""
+    high: float | int
+    """Greatest per-point time, ticks."""
+
+
+@dataclass(frozen=True)
+class PointTiming:
+    """How per-point ticks become seconds from the scan's start."""
+
+    tick_ns: int
+    """Length of a tick, ns."""
+    absolute: bool
+    """Whether ticks count from an epoch instead of from the scan."""
+    anchor: Literal["points", "start", "end", "inside"]
+    """What fixes the scan in time: its own absolute times, or the header stamp at that place of the scan."""
+    sweep: float
+    """Usual duration of a scan, s."""
+    note: str
+
+    def outliers(self, time: NDArray[Any]) -> NDArray[np.bool_] | None:
+        """Mark the points whose time cannot belong to their scan, (n,); None where all can.
+
+        Args:
+            time: (n,) ticks of the real returns.
+        """
+        longest = 2.0 * self.sweep * 1e9 / self.tick_ns
+        if time.size == 0 or time.max().item() - time.min().item() <= longest:
+            return None
+        wrong: NDArray[np.bool_] = np.abs(time.astype(np.float64) - float(np.median(time))) > 0.75 * longest
+        return wrong
+
+    def place(
+        self, header_ns: int, time: NDArray[Any], low: float | int, high: float | int
+    ) -> tuple[int, NDArray[np.float32], float]:
+        """Return the scan's start in ns, the points' times in s from there, and the scan's duration in s.
+
+        Args:
+            header_ns: stamp of the message.
+            time: (n,) ticks.
+            low, high: least and greatest tick of the scan.
+        """
+        tick = self.tick_ns * 1e-9
+        # Relative times from zero keep their zero: the first firings may not have returned.
+        zero = low if self.absolute else min(low, 0)
+        last = high
+        if self.anchor == "end" and zero < 0 and not self.absolute:
+            last = max(high, 0)
+        duration = float((last - zero) * tick)
+        # Subtract in the ticks' own type: only the difference fits a float32.
+        since = (time - time.dtype.type(zero)) * tick
+        start_ns = header_ns
+        if self.anchor == "points":
+            start_ns = _ticks_to_ns(low, self.tick_ns)
+        elif self.anchor == "end":
+            start_ns = header_ns - round(duration * 1e9)
+        elif self.anchor == "inside":
+            start_ns = header_ns + round(zero * self.tick_ns)
+        return start_ns, np.clip(since.astype(np.float32), 0.0, np.float32(duration)), duration
+
+
+def scan_period(header_ns: Sequence[int], fallback: float) -> float:
+    """Return the usual time between scans in s, from their header stamps in any order."""
+    steps = np.diff(np.unique(np.asarray(header_ns, np.int64)))
+    return float(np.median(steps)) * 1e-9 if steps.size else fallback
+
+
+def recognise_point_time(
+    samples: Sequence[TimeSample], field: str, kind: str, config: DataConfig
+) -> PointTiming | None:
+    """Settle the meaning of per-point times from the first scans; None where they are all the same.
+
+    Args:
+        samples: of several consecutive scans, at least one.
+        field: name of the time field, for the note.
+        kind: its data type, for the note.
+        config: overrides, and the scan period where there is only one scan.
+    """
+    period = scan_period([sample.header_ns for sample in samples], config.scan_period)
+    spread = float(np.median([sample.high - sample.low for sample in samples]))
+    if spread <= 0:
+        return None
+    absolute = (
+        _is_absolute(samples, spread)
+        if config.time_reference == "auto"
+        else config.time_reference == "absolute"
+    )
+    unit = config.time_unit if config.time_unit != "auto" else _unit(samples, spread, period, absolute)
+    tick_ns = TICK_NS[unit]
+    sweep = spread * tick_ns * 1e-9
+    anchor, where = _anchor(samples, tick_ns, absolute, sweep, config)
+    said = (
+        f"per-point time: field {field!r}, {kind} {unit} {'absolute' if absolute else 'relative'}, "
+        f"{sweep:.4f} s a scan, {where}"
+    )
+    if not 0.1 <= sweep / period <= 2.0:
+        said += f"; that does not fit the {period:.4g} s between scans, check config.data.time_unit"
+    return PointTiming(tick_ns, absolute, anchor, sweep, said)
+
+
+def stamp_end(
+    samples: Sequence[TimeSample], sweep: float, config: DataConfig
+) -> tuple[Literal["start", "end"], str]:
+    """Tell which end of the scan header stamps mark, where points do not say it, and how that is known."""
+    if config.stamp_at != "auto":
+        return config.stamp_at, f"header stamp at scan {config.stamp_at} (config.data.stamp_at)"
+    latency = np.array([sample.received_ns - sample.header_ns for sample in samples]) * 1e-9
+    if latency.min() > _CLEARLY_RECEIVED_LATER and latency.max() < 0.9 * sweep:
+        return "end", f"header stamp at scan end (received {np.median(latency):.3f} s after it)"
+    if latency.min() >= 0.9 * sweep and latency.max() < _LONGEST_LATENCY:
+        return "start", "header stamp at scan start"
+    return "start", "header stamp at scan start (assumed; config.data.stamp_at=end otherwise)"
+
+
+def _is_absolute(samples: Sequence[TimeSample], spread: float) -> bool:
+    if min(abs(sample.low) for sample in samples) > 10 * spread:
+        return True
+    ordered = sorted(samples, key=lambda sample: sample.header_ns)
+    advances = [
+        later.low - earlier.low for earlier, later in pairwise(ordered) if later.header_ns > earlier.header_ns
+    ]
+    return bool(advances) and float(np.median(advances)) > 0.5 * spread
+
+
+def _unit(samples: Sequence[TimeSample], spread: float, period: float, absolute: bool) -> str:
+    ticks, nanoseconds = spread, period * 1e9
+    if absolute:
+        first, last = min(samples, key=_header), max(samples, key=_header)
+        if last.header_ns > first.header_ns and last.low > first.low:
+            ticks, nanoseconds = float(last.low - first.low), float(last.header_ns - first.header_ns)
+        elif first.header_ns > 0 and first.low > 0:
+            since_epoch = {unit: first.low * tick / first.header_ns for unit, tick in TICK_NS.items()}
+            for unit, ratio in since_epoch.items():
+                if 0.5 < ratio < 2.0:
+                    return unit
+    return min(TICK_NS, key=lambda unit: abs(math.log(ticks * TICK_NS[unit] / nanoseconds)))
+
+
+def _anchor(
+    samples: Sequence[TimeSample], tick_ns: int, absolute: bool, sweep: float, config: DataConfig
+) -> tuple[Literal["points", "start", "end", "inside"], str]:
+    if config.stamp_at != "auto":
+        return stamp_end(samples, sweep, config)
+    if absolute:
+        # Where in the scan the header lies on the points' own clock: 0 its start, 1 its end.
+        offsets = [(s.header_ns - _ticks_to_ns(s.low, tick_ns)) * 1e-9 for s in samples]
+        place = float(np.median(offsets)) / sweep
+        if -1.0 < place < 2.0:
+            word = (
+                "start"
+                if abs(place) < 0.1
+                else "end"
+                if abs(place - 1.0) < 0.1
+                else f"{place:.2f} of the scan"
+            )
+            return "points", f"header stamp at {'scan ' if word in ('start', 'end') else ''}{word}"
+        anchor, said = stamp_end(samples, sweep, config)
+        return anchor, f"{said}, points on another clock than the header ({np.median(offsets):+.3f} s)"
+    low = float(np.median([s.low for s in samples])) * tick_ns * 1e-9
+    high = float(np.median([s.high for s in samples])) * tick_ns * 1e-9
+    if low < -0.02 * sweep:
+        if high <= 0.1 * sweep:
+            return "end", "header stamp at scan end (times are negative)"
+        return "inside", f"header stamp {-low:.3f} s into the scan (times of both signs)"
+    return stamp_end(samples, sweep, config)
+
+
+def _header(sample: TimeSample) -> int:
+    return sample.header_ns
+
+
+def _ticks_to_ns(ticks: float | int, tick_ns: int) -> int:
+    """Convert exactly: seconds since the epoch times 1e9 would lose 100 ns in a double."""
+    whole = math.floor(ticks)
+    return whole * tick_ns + round((ticks - whole) * tick_ns)

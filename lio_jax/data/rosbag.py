@@ -1,0 +1,218 @@
+"""Read ROS 1 and ROS 2 bags as a Sequence: clouds streamed, inertial and GPS samples gathered in one pass."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lio_jax.core.config import DataConfig
+from lio_jax.core.errors import LioJaxError
+from lio_jax.data import gps_messages, imu_messages, livox, pointcloud2
+from lio_jax.data.bag_files import bag_paths, open_bag, until_damage
+from lio_jax.data.bag_scans import decode_cloud, recognise_scans
+from lio_jax.data.bag_topics import Topic, bag_topics, choose_topic, listed
+from lio_jax.data.gps_messages import GpsCollector
+from lio_jax.data.imu_messages import ImuCollector
+from lio_jax.data.imu_units import accel_scale
+from lio_jax.data.order import StampOrder
+from lio_jax.data.ros_header import read_header
+from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
+from lio_jax.data.trajectory import Trajectory
+from lio_jax.data.warning_log import WarningLog
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+_LIDAR_TYPES = dict.fromkeys((pointcloud2.TYPE, *sorted(livox.TYPES)), "a point cloud")
+_IMU_TYPES = {imu_messages.TYPE: "an Imu"}
+_GPS_TYPES = {gps_messages.FIX_TYPE: "a NavSatFix", gps_messages.ODOMETRY_TYPE: "an Odometry"}
+_GPS_NAMES = ("gps", "gnss", "rtk")
+
+
+class RosbagSequence:
+    """A bag, or a folder of the split bags of one recording.
+
+    Each pass over the data opens the bag anew, so scans may be decoded on one thread while another asks for
+    inertial samples. Notes about IMU and GPS join :attr:`info` once these have been read.
+    """
+
+    def __init__(self, path: Path, config: DataConfig) -> None:
+        """Choose topics and settle from the first clouds how they are read.
+
+        Raises:
+            LioJaxError: no bag, a damaged bag, no point clouds, or a topic or field that is not there.
+        """
+        self._path, self._config = path, config
+        self._paths = bag_paths(path)
+        self._warnings = WarningLog()
+        self._samples: tuple[ImuData | None, GpsData | None] | None = None
+        with open_bag(self._paths) as reader:
+            topics = bag_topics(reader.connections)
+            self._notes = [f"{len(self._paths)} files read as one recording"] if len(self._paths) > 1 else []
+            self._lidar = self._choose_lidar(topics)
+            self._imu_topic = self._choose("imu_topic", config.imu_topic, topics, _IMU_TYPES)
+            self._gps_topic = self._choose_gps(topics)
+            messages = until_damage(_messages(reader, self._lidar), lambda reason: None)
+            self._reading = recognise_scans(reader, self._lidar, messages, config, self._where)
+        self._notes.extend(self._reading.notes)
+
+    @property
+    def info(self) -> SequenceInfo:
+        """Return what is known without decoding scans."""
+        return SequenceInfo(
+            name=self._path.name if self._path.is_dir() else self._path.stem,
+            format="rosbag",
+            path=str(self._path),
+            scan_count=self._lidar.count,
+            notes=tuple(self._notes),
+        )
+
+    @property
+    def warnings_so_far(self) -> tuple[str, ...]:
+        """Return one sentence for each problem met up to now."""
+        return self._warnings.sentences
+
+    def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
+        """Yield scans ``start`` to ``start + count`` by their place in the bag; an empty one has n = 0.
+
+        Where the bag turns out to be damaged the iteration ends with a warning; a single message that cannot
+        be decoded, a duplicate and a step back in time are left out with a warning.
+        """
+        order = StampOrder(self._warnings.add)
+        with open_bag(self._paths) as reader:
+            for number, raw in self._lidar_messages(reader):
+                if count is not None and number >= start + count:
+                    return
+                if number < start:
+                    continue
+                name = f"{self._path.name}: scan {number}"
+                try:
+                    cloud = decode_cloud(reader, self._lidar, raw, self._config.time_field, self._where)
+                except ValueError as error:
+                    self._warnings.add(f"{name} cannot be read and was skipped: {error}.")
+                    continue
+                scan = self._reading.scan(cloud, name, self._warnings.add)
+                if order.accept(scan.stamp_ns, name):
+                    yield scan
+
+    def header_stamps(self) -> Iterator[int]:
+        """Yield the header stamp in ns of every cloud without decoding any."""
+        with open_bag(self._paths) as reader:
+            for _, raw in self._lidar_messages(reader):
+                yield read_header(raw, reader.is2).stamp_ns
+
+    def imu(self) -> ImuData | None:
+        """Return all inertial samples, or None where there are none."""
+        return self._read_samples()[0]
+
+    def gps(self) -> GpsData | None:
+        """Return all GPS fixes, or None where there are none."""
+        return self._read_samples()[1]
+
+    def truth(self) -> Trajectory | None:
+        """Return None: a bag states no ground truth."""
+        return None
+
+    @property
+    def _where(self) -> str:
+        return f"{self._path}: topic {self._lidar.name}"
+
+    def _choose(
+        self, key: str, wanted: str, topics: tuple[Topic, ...], types: dict[str, str]
+    ) -> Topic | None:
+        chosen, note = choose_topic(self._path, topics, key, wanted, types)
+        if note:
+            self._notes.append(f"{key.removesuffix('_topic')}: {note}")
+        return chosen
+
+    def _choose_lidar(self, topics: tuple[Topic, ...]) -> Topic:
+        lidar = self._choose("lidar_topic", self._config.lidar_topic, topics, _LIDAR_TYPES)
+        if lidar is None:
+            raise LioJaxError(
+                f"{self._path}: no topic holds point clouds (PointCloud2 or Livox CustomMsg); "
+                f"its topics are {listed(topics) or 'none'}."
+            )
+        if not lidar.count:
+            raise LioJaxError(
+                f"{self._path}: topic {lidar.name} holds no messages; record or choose another."
+            )
+        return lidar
+
+    def _choose_gps(self, topics: tuple[Topic, ...]) -> Topic | None:
+        """Take an Odometry as GPS unasked only if its name says so: most are some estimator's output."""
+        if self._config.gps_topic:
+            return self._choose("gps_topic", self._config.gps_topic, topics, _GPS_TYPES)
+        fixes = tuple(topic for topic in topics if topic.type == gps_messages.FIX_TYPE)
+        odometry = tuple(topic for topic in topics if topic.type == gps_messages.ODOMETRY_TYPE)
+        named = tuple(topic for topic in odometry if any(word in topic.name.lower() for word in _GPS_NAMES))
+        if odometry and not (fixes or named):
+            self._notes.append(
+                f"gps: none; {odometry[0].name} (Odometry) is used as GPS with "
+                f"--set config.data.gps_topic={odometry[0].name}"
+            )
+        return self._choose("gps_topic", "", fixes or named, _GPS_TYPES)
+
+    def _lidar_messages(self, reader: "AnyReader") -> Iterator[tuple[int, bytes]]:
+        last = -1
+
+        def broken(reason: str) -> None:
+            self._warnings.add(
+                f"{self._path}: the bag is damaged after scan {last} of {self._lidar.count} ({reason}): "
+                "reading ended there."
+            )
+
+        for number, (_, _, raw) in enumerate(until_damage(_messages(reader, self._lidar), broken)):
+            last = number
+            yield number, raw
+
+    def _read_samples(self) -> tuple[ImuData | None, GpsData | None]:
+        if self._samples is None:
+            topics = [topic for topic in (self._imu_topic, self._gps_topic) if topic is not None]
+            self._samples = self._gather(topics) if topics else (None, None)
+        return self._samples
+
+    def _gather(self, topics: list[Topic]) -> tuple[ImuData | None, GpsData | None]:
+        def broken(reason: str) -> None:
+            self._warnings.add(f"{self._path}: the bag is damaged ({reason}): IMU and GPS samples end there.")
+
+        with open_bag(self._paths) as reader:
+            imu, gps = ImuCollector(reader.is2), GpsCollector()
+            take: dict[str, Callable[[bytes], None]] = {}
+            if self._imu_topic is not None:
+                take[self._imu_topic.name] = imu.add
+            if self._gps_topic is not None:
+                gps_type = self._gps_topic.type
+                take[self._gps_topic.name] = lambda raw: gps.add(reader.deserialize(raw, gps_type))
+            unreadable = dict.fromkeys(take, 0)
+            for connection, _, raw in until_damage(_messages(reader, *topics), broken):
+                try:
+                    take[connection.topic](raw)
+                # The generated decoders raise struct, index or their own errors on damaged bytes.
+                except Exception:
+                    unreadable[connection.topic] += 1
+        for name, number in unreadable.items():
+            if number:
+                self._warnings.add(
+                    f"{self._path}: {number} messages of {name} cannot be read and were skipped."
+                )
+        return self._finished_imu(imu), self._finished_gps(gps)
+
+    def _finished_imu(self, collector: ImuCollector) -> ImuData | None:
+        imu, repairs = collector.imu()
+        for repair in repairs:
+            self._warnings.add(f"{self._path}: {repair}")
+        if imu is None:
+            return None
+        scale, note = accel_scale(imu.accel, self._config)
+        if note:
+            self._notes.append(f"imu: {note}")
+        return ImuData(imu.stamp_ns, imu.gyro, imu.accel * scale, imu.orientation)
+
+    def _finished_gps(self, collector: GpsCollector) -> GpsData | None:
+        gps, notes = collector.gps()
+        self._notes.extend(notes)
+        return gps
+
+
+def _messages(reader: "AnyReader", *topics: Topic) -> Iterator[tuple[Any, int, bytes]]:
+    wanted = {(topic.name, topic.type) for topic in topics}
+    return reader.messages([c for c in reader.connections if (c.topic, c.msgtype) in wanted])

@@ -1,0 +1,149 @@
+"""Time-stamped poses on the host, and the two text formats the field exchanges them in."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from lio_jax.core.errors import LioJaxError
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses T_world_body at int64 nanosecond stamps."""
+
+    stamp_ns: NDArray[np.int64]
+    """(n,) ascending."""
+    poses: NDArray[np.float64]
+    """(n, 4, 4) T_world_body."""
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """(n, 3) m, in world."""
+        return self.poses[:, :3, 3]
+
+    @property
+    def quaternions(self) -> NDArray[np.float64]:
+        """(n, 4) xyzw of the rotations world from body."""
+        return Rotation.from_matrix(self.poses[:, :3, :3]).as_quat()
+
+    def times_body(self, T_body_other: NDArray[np.float64]) -> "Trajectory":
+        """Return T_world_other = T_world_body T_body_other."""
+        return Trajectory(self.stamp_ns, self.poses @ T_body_other)
+
+    def at(self, stamp_ns: NDArray[np.int64]) -> "Trajectory":
+        """Interpolate at the stamps that lie within the trajectory's span; others are left out.
+
+        Rotation by slerp, position linearly between neighbouring poses.
+        """
+        stamp_ns = np.asarray(stamp_ns, np.int64)
+        inside = stamp_ns[(stamp_ns >= self.stamp_ns[0]) & (stamp_ns <= self.stamp_ns[-1])]
+        if len(self) == 1 or inside.size == 0:
+            return Trajectory(inside, np.repeat(self.poses[:1], inside.size, axis=0))
+        origin = self.stamp_ns[0]
+        knots = (self.stamp_ns - origin) * 1e-9
+        query = (inside - origin) * 1e-9
+        poses = np.tile(np.eye(4), (inside.size, 1, 1))
+        poses[:, :3, :3] = Slerp(knots, Rotation.from_matrix(self.poses[:, :3, :3]))(query).as_matrix()
+        for axis in range(3):
+            poses[:, axis, 3] = np.interp(query, knots, self.positions[:, axis])
+        return Trajectory(inside, poses)
+
+
+def pose_matrices(positions: NDArray[np.float64], quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Assemble (n, 4, 4) poses from (n, 3) positions and (n, 4) xyzw quaternions."""
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
+    poses[:, :3, 3] = positions
+    return poses
+
+
+def seconds_to_ns(text: str) -> int:
+    """Convert decimal seconds to ns without passing through a float, which cannot hold epoch time to a ns."""
+    whole, _, fraction = text.partition(".")
+    if not fraction or not fraction.isdigit() or not whole.isdigit():
+        return round(float(text) * 1e9)
+    return int(whole) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
+
+
+def ns_to_seconds(stamp_ns: int) -> str:
+    """Write ns as decimal seconds with 9 decimals, exactly."""
+    sign, stamp = ("-", -stamp_ns) if stamp_ns < 0 else ("", stamp_ns)
+    return f"{sign}{stamp // 1_000_000_000}.{stamp % 1_000_000_000:09d}"
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read lines ``t x y z qx qy qz qw`` (s, m, xyzw).
+
+    Raises:
+        LioJaxError: a line does not hold eight numbers, or time does not ascend.
+    """
+    stamps, rows = [], []
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        words = line.replace(",", " ").split("#")[0].split()
+        if not words:
+            continue
+        try:
+            if len(words) != 8:
+                raise ValueError
+            stamps.append(seconds_to_ns(words[0]))
+            rows.append([float(word) for word in words[1:]])
+        except ValueError:
+            raise LioJaxError(
+                f"{path}: line {number} is not 't x y z qx qy qz qw' (eight numbers); fix or remove it."
+            ) from None
+    if not rows:
+        raise LioJaxError(
+            f"{path}: holds no poses; a TUM trajectory has one line 't x y z qx qy qz qw' each."
+        )
+    values = np.array(rows)
+    return _checked(path, Trajectory(np.array(stamps, np.int64), pose_matrices(values[:, :3], values[:, 3:])))
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write ``t x y z qx qy qz qw`` with 9 decimals of time."""
+    lines = [
+        f"{ns_to_seconds(int(stamp))} " + " ".join(f"{value:.9f}" for value in (*position, *quaternion))
+        for stamp, position, quaternion in zip(
+            trajectory.stamp_ns, trajectory.positions, trajectory.quaternions, strict=True
+        )
+    ]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def read_kitti_poses(path: Path) -> NDArray[np.float64]:
+    """Read (n, 4, 4) poses from lines of twelve numbers (3x4, row major).
+
+    Raises:
+        LioJaxError: a line does not hold twelve numbers.
+    """
+    try:
+        rows = np.loadtxt(path, ndmin=2)
+    except ValueError as error:
+        raise LioJaxError(f"{path}: not a KITTI pose file ({error}); each line holds 12 numbers.") from None
+    if rows.shape[1] != 12:
+        raise LioJaxError(
+            f"{path}: {rows.shape[1]} numbers a line; a KITTI pose file holds 12 (3x4, row major)."
+        )
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :] = rows.reshape(-1, 3, 4)
+    return poses
+
+
+def write_kitti_poses(path: Path, poses: NDArray[np.float64]) -> None:
+    """Write (n, 4, 4) poses as lines of twelve numbers."""
+    np.savetxt(path, poses[:, :3, :].reshape(-1, 12), fmt="%.9e")
+
+
+def _checked(path: Path, trajectory: Trajectory) -> Trajectory:
+    if np.any(np.diff(trajectory.stamp_ns) <= 0):
+        line = int(np.argmax(np.diff(trajectory.stamp_ns) <= 0)) + 2
+        raise LioJaxError(
+            f"{path}: time does not ascend at pose {line}; sort the file and remove duplicates."
+        )
+    return trajectory

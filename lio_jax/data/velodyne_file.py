@@ -1,0 +1,103 @@
+"""Point files of KITTI: binary float32 or text rows ``x y z intensity``, and what to do with broken ones."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.data.reconstruct import ring_from_azimuth_wraps, ring_from_elevation
+from lio_jax.data.returns import valid_returns
+
+_BYTES_PER_POINT = 16
+_HDL64_BEAMS = 64
+
+
+def numbered_files(folder: Path, suffixes: Iterable[str]) -> dict[int, Path]:
+    """Return the files whose names are numbers, by number, ascending."""
+    wanted = set(suffixes)
+    found = {
+        int(path.stem): path for path in folder.iterdir() if path.suffix in wanted and path.stem.isdigit()
+    }
+    return dict(sorted(found.items()))
+
+
+def missing_numbers(files: dict[int, Path]) -> list[int]:
+    """Return the numbers that are absent between the first and the last."""
+    numbers = list(files)
+    return sorted(set(range(numbers[0], numbers[-1])) - set(numbers)) if numbers else []
+
+
+def listed(numbers: list[int], digits: int) -> str:
+    """Write scan numbers as runs: ``000003, 000007-000012``."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    return ", ".join(
+        f"{first:0{digits}d}" if first == last else f"{first:0{digits}d}-{last:0{digits}d}"
+        for first, last in runs
+    )
+
+
+def read_returns(path: Path, warn: Callable[[str], None]) -> NDArray[np.float32] | None:
+    """Read the valid returns of one point file: (n, 4) x, y, z in m and intensity.
+
+    NaN, infinite and zero points are dropped. An empty file gives an empty scan, a truncated one its whole
+    points, both with a warning; a file that cannot be read at all gives None with a warning.
+    """
+    try:
+        rows = _read_text(path, warn) if path.suffix == ".txt" else _read_binary(path, warn)
+    except (OSError, ValueError) as error:
+        warn(f"{path}: cannot be read ({error}), the scan was skipped.")
+        return None
+    valid = valid_returns(rows)
+    return rows if valid.all() else rows[valid]
+
+
+def check_sizes(paths: Iterable[Path], warn: Callable[[str], None]) -> None:
+    """Warn of empty and truncated binary files without reading them, as :func:`read_returns` will."""
+    for path in paths:
+        if path.suffix == ".bin":
+            _check_size(path, path.stat().st_size, warn)
+
+
+def hdl64_ring(points: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Return the beams by storage order; by elevation where the file's order is not KITTI's."""
+    ring = ring_from_azimuth_wraps(points)
+    if ring.size and ring[-1] >= _HDL64_BEAMS:
+        return ring_from_elevation(points, _HDL64_BEAMS)
+    return ring
+
+
+def _read_binary(path: Path, warn: Callable[[str], None]) -> NDArray[np.float32]:
+    size = path.stat().st_size
+    _check_size(path, size, warn)
+    return np.fromfile(path, np.float32, count=size // _BYTES_PER_POINT * 4).reshape(-1, 4)
+
+
+def _check_size(path: Path, size: int, warn: Callable[[str], None]) -> None:
+    if size == 0:
+        warn(f"{path}: the file is empty (0 bytes): an empty scan.")
+    elif size % _BYTES_PER_POINT:
+        warn(
+            f"{path}: truncated ({size} bytes, no multiple of {_BYTES_PER_POINT}): its whole points are used."
+        )
+
+
+def _read_text(path: Path, warn: Callable[[str], None]) -> NDArray[np.float32]:
+    lines = path.read_text().split("\n")
+    while lines and not lines[-1].strip():
+        lines.pop()
+    if not lines:
+        warn(f"{path}: the file is empty: an empty scan.")
+        return np.zeros((0, 4), np.float32)
+    if len(lines[-1].split()) != 4:
+        lines.pop()
+        warn(f"{path}: truncated (the last line is not 'x y z intensity'): its whole points are used.")
+    rows = np.loadtxt(lines, np.float32, ndmin=2) if lines else np.zeros((0, 4), np.float32)
+    if rows.shape[1] != 4:
+        raise ValueError(f"{rows.shape[1]} numbers a line instead of 4")
+    return rows

@@ -1,0 +1,101 @@
+"""Read a trajectory from whatever holds one: TUM and KITTI text files, run folders, recordings with truth."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.errors import LioJaxError
+from lio_jax.data.trajectory import Trajectory, read_kitti_poses, read_tum, seconds_to_ns
+
+_RUN_TRAJECTORY = "trajectory.tum"
+
+
+@dataclass(frozen=True)
+class LoadedTrajectory:
+    """A trajectory and how much is known about its stamps."""
+
+    trajectory: Trajectory
+    stamped: bool
+    """False: the file holds no stamps and ``stamp_ns`` merely counts 0, 1, 2, ..."""
+    source: str
+    """The file or recording it was read from, for messages."""
+
+
+def load_trajectory(path: Path) -> LoadedTrajectory:
+    """Read the trajectory that ``path`` holds.
+
+    A run folder gives its trajectory.tum, a recording its ground truth (both T_world_imu); a text file is
+    taken for TUM (8 numbers a line) or KITTI poses (12). KITTI poses get their stamps from a times.txt beside
+    them, from ``../sequences/NN/times.txt``, or from the trajectory.tum of the same run.
+
+    Raises:
+        LioJaxError: there is nothing there, or nothing that holds a trajectory.
+    """
+    if not path.exists():
+        raise LioJaxError(
+            f"{path}: there is no such file or folder; give a trajectory, a run folder or a recording."
+        )
+    if path.is_dir() and (path / _RUN_TRAJECTORY).is_file():
+        path = path / _RUN_TRAJECTORY
+    if path.is_dir() or path.suffix in _bag_suffixes():
+        return _recorded_truth(path)
+    try:
+        columns = _columns(path)
+        if columns == 8:
+            return LoadedTrajectory(read_tum(path), True, str(path))
+        if columns == 12:
+            return _kitti(path)
+    except ValueError as error:
+        raise LioJaxError(f"{path}: not a trajectory ({error}); give a TUM or KITTI pose file.") from None
+    raise LioJaxError(
+        f"{path}: {columns} numbers in its first line; a TUM trajectory has 8 (t x y z qx qy qz qw), "
+        "a KITTI pose file 12."
+    )
+
+
+def _columns(path: Path) -> int:
+    with path.open() as lines:
+        for line in lines:
+            words = line.replace(",", " ").split("#")[0].split()
+            if words:
+                return len(words)
+    raise LioJaxError(f"{path}: holds no poses; the run that should have written it has probably failed.")
+
+
+def _kitti(path: Path) -> LoadedTrajectory:
+    poses = read_kitti_poses(path)
+    stamps = _kitti_stamps(path, len(poses))
+    if stamps is None:
+        return LoadedTrajectory(Trajectory(np.arange(len(poses), dtype=np.int64), poses), False, str(path))
+    return LoadedTrajectory(Trajectory(stamps, poses), True, str(path))
+
+
+def _kitti_stamps(path: Path, count: int) -> NDArray[np.int64] | None:
+    beside = path.with_name(_RUN_TRAJECTORY)
+    if path.name == "trajectory_kitti.txt" and beside.is_file():
+        stamps = read_tum(beside).stamp_ns
+        if len(stamps) == count:
+            return stamps
+    for times in (path.with_name("times.txt"), path.parent.parent / "sequences" / path.stem / "times.txt"):
+        if times.is_file():
+            stamps = np.array([seconds_to_ns(word) for word in times.read_text().split()], np.int64)
+            if len(stamps) == count and np.all(np.diff(stamps) > 0):
+                return stamps
+    return None
+
+
+def _bag_suffixes() -> tuple[str, ...]:
+    from lio_jax.data.open import BAG_SUFFIXES
+
+    return BAG_SUFFIXES
+
+
+def _recorded_truth(path: Path) -> LoadedTrajectory:
+    from lio_jax.data.open import open_sequence
+
+    truth = open_sequence(path).truth()
+    if truth is None or len(truth) == 0:
+        raise LioJaxError(f"{path}: this recording holds no ground truth; give a trajectory file instead.")
+    return LoadedTrajectory(truth, True, str(path))

@@ -1,0 +1,33 @@
+"""Motion compensation: express every point in the sensor frame of one instant."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Float32
+
+
+def deskew_constant_velocity(
+    points: Float32[Array, "n 3"], delay: Float32[Array, " n"], twist: Float[Array, "6"]
+) -> Float32[Array, "n 3"]:
+    """Move points measured ``delay`` seconds after an instant into the sensor frame of that instant.
+
+    p' = exp(delay * twist) p, the SE(3) exponential in closed form (Rodrigues), in float32 and without a
+    quaternion per point.
+
+    Args:
+        points: m, sensor frame at each point's own firing time.
+        delay: firing time minus the instant, s; negative before it.
+        twist: velocity of the sensor in its own frame, translation (m/s) first, then rotation (rad/s).
+    """
+    velocity, rate = twist[:3].astype(jnp.float32), twist[3:].astype(jnp.float32)
+    angle_squared = delay**2 * jnp.sum(rate**2)
+    small = angle_squared < 1e-6
+    safe = jnp.where(small, 1.0, angle_squared)
+    angle = jnp.sqrt(safe)
+    a = jnp.where(small, 1 - angle_squared / 6, jnp.sin(angle) / angle)
+    b = jnp.where(small, 0.5 - angle_squared / 24, (1 - jnp.cos(angle)) / safe)
+    c = jnp.where(small, 1 / 6 - angle_squared / 120, (1 - a) / safe)
+    omega = delay[:, None] * rate
+    shift = delay[:, None] * velocity
+    crossed = jnp.cross(omega, points)
+    rotated = points + a[:, None] * crossed + b[:, None] * jnp.cross(omega, crossed)
+    swept = jnp.cross(omega, shift)
+    return rotated + shift + b[:, None] * swept + c[:, None] * jnp.cross(omega, swept)

@@ -1,0 +1,22 @@
+"""The recipes: pure step functions that read like the block diagrams of the systems they stand for."""
+
+from types import ModuleType
+
+from lio_jax.core.errors import UsageError
+from lio_jax.recipes import default
+
+RECIPES: dict[str, ModuleType] = {"default": default}
+"""By name; each module has ``State``, ``Output``, ``init(config, params)`` and ``step(config, params, state, scan, imu)``."""
+
+
+def recipe_named(name: str) -> ModuleType:
+    """Return a recipe's module.
+
+    Raises:
+        UsageError: there is none of that name (lists those there are).
+    """
+    if name not in RECIPES:
+        raise UsageError(
+            f"recipe '{name}' is not known; there are: {', '.join(RECIPES)}; or give a settings file *.yaml."
+        )
+    return RECIPES[name]

@@ -1,0 +1,195 @@
+"""Register a scan against the voxel map: point-to-distribution, robust Gauss-Newton, degeneracy aware."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Float32, Int32
+
+from lio_jax.core.geometry import inverse3, largest_eigenvalue3, symmetric3
+from lio_jax.core.params import Params
+from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, query_nearest
+
+CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES = 0, 1, 2
+"""Status codes of a solve."""
+
+
+class Registration(eqx.Module):
+    """Result of a scan-to-map solve."""
+
+    T_world_lidar: jaxlie.SE3
+    information: Float[Array, "6 6"]
+    """Inverse covariance of the right perturbation, rotation (rad) before translation (m)."""
+    degenerate: Bool[Array, " 6"]
+    """Which eigenvectors of the scaled information were held at the prediction, weakest first."""
+    matches: Int32[Array, ""]
+    """Points that found a distribution in the map."""
+    rmse: Float[Array, ""]
+    """Robustly weighted root mean square distance to the map, m."""
+    iterations: Int32[Array, ""]
+    status: Int32[Array, ""]
+    """CONVERGED, ITERATION_LIMIT or TOO_FEW_MATCHES; in the last case the pose is the prediction."""
+
+
+class NormalEquations(eqx.Module):
+    """The solve linearised at one pose, in world axes at the sensor's position."""
+
+    hessian: Float[Array, "6 6"]
+    gradient: Float[Array, "6"]
+    matches: Int32[Array, ""]
+    weight: Float[Array, ""]
+    """Sum of the robust weights."""
+    squared_error: Float[Array, ""]
+    """Robustly weighted sum of squared distances, m^2."""
+    arm_squared: Float[Array, ""]
+    """Mean squared distance of the points from the sensor, m^2: makes rotations and translations comparable."""
+
+
+def linearise(
+    vmap: VoxelMap,
+    points: Float32[Array, "k 3"],
+    mask: Bool[Array, " k"],
+    T_world_lidar: jaxlie.SE3,
+    kernel: Float[Array, ""],
+    params: Params,
+) -> NormalEquations:
+    """Associate the points with the map at a pose and return the weighted normal equations there.
+
+    With the voxel's covariance C, its largest eigenvalue l and the range noise s, a point's offset e from the
+    mean costs e' W e with W = (s^2 I + C)^-1 - (s^2 + l)^-1 I: the excess over the least known direction. A flat
+    voxel acts as a plane, a thin one as a line, a shapeless one not at all, with no class boundaries between
+    (Biber & Strasser, "The normal distributions transform", IROS 2003, less its pull towards the mean).
+    Robust weight: Geman-McClure on s sqrt(e' W e), the noise-scaled distance in m.
+    """
+    dtype = T_world_lidar.wxyz_xyz.dtype
+    voxel_size = params.map.voxel_size.astype(jnp.float32)
+    variance = params.lidar.range_sigma.astype(jnp.float32) ** 2
+    anchor, corner = anchor_of(T_world_lidar.translation(), params.map.voxel_size)
+    rotation = T_world_lidar.rotation().as_matrix().astype(jnp.float32)
+    arm = points @ rotation.T
+    anchored = arm + (T_world_lidar.translation() - corner).astype(jnp.float32)
+    near = query_nearest(vmap, anchored, anchor, voxel_size, params.map.min_points.astype(jnp.float32))
+
+    diagonal = near.diagonal + variance
+    precision, off_precision = inverse3(diagonal, near.off_diagonal)
+    least_known = 1 / largest_eigenvalue3(diagonal, near.off_diagonal)
+    precision = symmetric3(precision - least_known[:, None], off_precision)
+
+    error = anchored - near.mean
+    weighted_error = jnp.sum(precision * error[:, None, :], -1)
+    distance_squared = variance * jnp.maximum(jnp.sum(error * weighted_error, -1), 0.0)
+    kernel_squared = kernel.astype(jnp.float32) ** 2
+    used = mask & near.valid
+    weight = jnp.where(used, (kernel_squared / (kernel_squared + distance_squared)) ** 2, 0.0)
+
+    x, y, z = jnp.moveaxis(arm, -1, 0)
+    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
+    jacobian = jnp.stack(
+        [
+            jnp.stack([zero, z, -y, one, zero, zero, error[:, 0]], -1),
+            jnp.stack([-z, zero, x, zero, one, zero, error[:, 1]], -1),
+            jnp.stack([y, -x, zero, zero, zero, one, error[:, 2]], -1),
+        ],
+        1,
+    )
+    weighted = weight[:, None, None] * jnp.sum(precision[..., None] * jacobian[:, None], 2)
+    gram = (jacobian.reshape(-1, 7).T @ weighted.reshape(-1, 7)).astype(dtype)
+    return NormalEquations(
+        hessian=(gram[:6, :6] + gram[:6, :6].T) / 2,
+        gradient=gram[:6, 6],
+        matches=jnp.sum(used, dtype=jnp.int32),
+        weight=jnp.sum(weight).astype(dtype),
+        squared_error=jnp.sum(weight * distance_squared).astype(dtype),
+        arm_squared=jnp.sum(jnp.where(used, jnp.sum(arm**2, -1), 0.0)).astype(dtype)
+        / jnp.maximum(jnp.sum(used), 1),
+    )
+
+
+def register(
+    vmap: VoxelMap,
+    points_at: Callable[[jaxlie.SE3], Float32[Array, "k 3"]],
+    mask: Bool[Array, " k"],
+    T_world_lidar: jaxlie.SE3,
+    prediction_error: Float[Array, ""],
+    params: Params,
+    max_iterations: int,
+) -> Registration:
+    """Find the pose at which the scan fits the map best.
+
+    The kernel starts as wide as the prediction may be wrong and halves with each iteration down to its own
+    scale, so that a scan without a velocity prior still finds the map (graduated non-convexity, Blake &
+    Zisserman 1987). Directions the scan does not constrain keep the prediction (Zhang & Singh, "On degeneracy of
+    optimization-based state estimation problems", ICRA 2016).
+
+    Args:
+        vmap: the map.
+        points_at: the motion-compensated points in the lidar frame, m, given the pose under trial: the
+            compensation may depend on it.
+        mask: which points are real.
+        T_world_lidar: predicted pose.
+        prediction_error: expected error of the prediction, m.
+        params: traced parameters.
+        max_iterations: bound of the loop.
+    """
+    settings = params.registration
+    dtype = T_world_lidar.wxyz_xyz.dtype
+
+    def opening(iteration: Array) -> Array:
+        return prediction_error * 0.5 ** iteration.astype(dtype)
+
+    def iterate(carry: tuple) -> tuple:
+        T, iteration, _, _, _ = carry
+        equations = linearise(vmap, points_at(T), mask, T, settings.kernel + opening(iteration), params)
+        step, degenerate = _solve_observable(equations, settings.degeneracy_ratio)
+        turn, move = step[:3], step[3:]
+        T = jaxlie.SE3.from_rotation_and_translation(
+            (jaxlie.SO3.exp(turn) @ T.rotation()).normalize(), T.translation() + move
+        )
+        small = (jnp.linalg.norm(turn) < settings.rotation_tolerance) & (
+            jnp.linalg.norm(move) < settings.translation_tolerance
+        )
+        done = (small & (opening(iteration) < settings.kernel)) | (equations.matches < settings.min_matches)
+        return T, iteration + 1, done, equations, degenerate
+
+    def unfinished(carry: tuple) -> Array:
+        return (carry[1] < max_iterations) & ~carry[2]
+
+    start = (T_world_lidar, jnp.int32(0), jnp.array(False))
+    shapes = jax.eval_shape(lambda: iterate((*start, None, None))[3:])
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    T, iterations, done, equations, degenerate = jax.lax.while_loop(unfinished, iterate, (*start, *blank))
+
+    lost = (equations.matches < settings.min_matches) | ~jnp.all(jnp.isfinite(T.wxyz_xyz))
+    T = jaxlie.SE3(jnp.where(lost, T_world_lidar.wxyz_xyz, T.wxyz_xyz))
+    to_body = jax.scipy.linalg.block_diag(*[T.rotation().as_matrix()] * 2)
+    return Registration(
+        T_world_lidar=T,
+        information=jnp.where(lost, 0.0, to_body.T @ equations.hessian @ to_body),
+        degenerate=degenerate,
+        matches=equations.matches,
+        rmse=jnp.sqrt(equations.squared_error / jnp.maximum(equations.weight, jnp.finfo(dtype).tiny)),
+        iterations=iterations,
+        status=jnp.where(lost, TOO_FEW_MATCHES, jnp.where(done, CONVERGED, ITERATION_LIMIT)).astype(
+            jnp.int32
+        ),
+    )
+
+
+def _solve_observable(
+    equations: NormalEquations, degeneracy_ratio: Float[Array, ""]
+) -> tuple[Float[Array, "6"], Bool[Array, " 6"]]:
+    """Return the Gauss-Newton step in the directions that are observed, and which are not.
+
+    Rotations are scaled by the scan's rms lever arm so that all six directions are in metres.
+    """
+    dtype = equations.hessian.dtype
+    scale = jnp.concatenate([jnp.full(3, 1.0) / jnp.sqrt(equations.arm_squared + 1e-6), jnp.ones(3)]).astype(
+        dtype
+    )
+    values, vectors = jnp.linalg.eigh(scale[:, None] * equations.hessian * scale)
+    degenerate = values <= jnp.maximum(degeneracy_ratio * values[-1], jnp.finfo(dtype).tiny)
+    along = -(vectors.T @ (scale * equations.gradient))
+    along = jnp.where(degenerate, 0.0, along / jnp.where(degenerate, 1.0, values))
+    return scale * (vectors @ along), degenerate

@@ -1,0 +1,37 @@
+"""Collect the map's points on disk while a run goes on, so that its memory does not grow."""
+
+import secrets
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.files import atomic_path
+
+
+class MapFile:
+    """Points new to the map are appended to a spool file and become a PCD at the end."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._spool_path = path.with_name(f".{path.name}.{secrets.token_hex(4)}.spool")
+        self._spool = self._spool_path.open("wb")
+
+    def append(self, points: NDArray[np.float32]) -> None:
+        """Add (n, 3) points, m in world."""
+        self._spool.write(np.ascontiguousarray(points, np.float32).tobytes())
+
+    def finish(self) -> NDArray[np.float32]:
+        """Write the PCD (binary, x y z) and return its (n, 3) points."""
+        from pypcd4 import Encoding, PointCloud
+
+        self._spool.close()
+        points = np.fromfile(self._spool_path, np.float32).reshape(-1, 3)
+        with atomic_path(self._path) as aside:
+            PointCloud.from_xyz_points(points).save(aside, encoding=Encoding.BINARY)
+        return points
+
+    def close(self) -> None:
+        """Remove the spool file, whatever happened."""
+        self._spool.close()
+        self._spool_path.unlink(missing_ok=True)

@@ -1,0 +1,189 @@
+"""Run a recipe over a recording and leave a run folder behind, whatever happens on the way."""
+
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from collections.abc import Sequence as Listing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.errors import LioJaxError
+from lio_jax.core.files import atomic_path
+from lio_jax.core.settings import Settings, with_extrinsics
+from lio_jax.data.prefetch import prefetched
+from lio_jax.data.sequence import LidarScan, Sequence
+from lio_jax.data.trajectory import Trajectory, write_kitti_poses, write_tum
+from lio_jax.loops.g2o import write_g2o
+from lio_jax.run.folder import write_json, write_text
+from lio_jax.run.keyframes import keyframe_indices, odometry_edges
+from lio_jax.run.map_file import MapFile
+from lio_jax.run.track import CompiledStep, Tracked, track
+from lio_jax.run.trajectory_log import TrajectoryLog
+
+
+class Observer(Protocol):
+    """Something that wants to see every scan's result: a recording, a progress bar."""
+
+    def __call__(self, tracked: Tracked, scan_ms: float) -> None:
+        """Take one result; its arrays must not be kept."""
+        ...
+
+
+@dataclass
+class RunResult:
+    """What a run computed."""
+
+    trajectory: Trajectory
+    """T_world_imu at the scans' ends."""
+    metrics: dict[str, Any]
+    """What metrics.json holds."""
+    stage_ms: dict[str, list[float]]
+    """Time of each stage for each scan."""
+    map_points: NDArray[np.float32] | None
+    """(n, 3) m in world; None where no map was asked for."""
+    interruption: BaseException | None = None
+    """What ended the run early, where something did."""
+    notes: list[str] = field(default_factory=list)
+
+
+def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list[str]]:
+    """Take T_imu_lidar from the recording's calibration unless it was given; say where it came from."""
+    given = any(path.startswith("params.extrinsics") for path in settings.given)
+    if given:
+        return settings, ["T_imu_lidar: as given in the settings."]
+    if sequence.info.T_imu_lidar is None:
+        return settings, ["T_imu_lidar: not in the recording; taken as identity (set params.extrinsics.*)."]
+    settings = with_extrinsics(settings, sequence.info.T_imu_lidar, sequence.info.path)
+    return settings, ["T_imu_lidar: from the recording's calibration."]
+
+
+def run_sequence(
+    sequence: Sequence,
+    settings: Settings,
+    out: Path,
+    start: int = 0,
+    count: int | None = None,
+    observers: Listing[Observer] = (),
+) -> RunResult:
+    """Estimate the recording's trajectory and map, and write the run folder's files.
+
+    An error or Ctrl-C in the middle ends the run; what was computed until then is written all the same.
+
+    Args:
+        sequence: the recording.
+        settings: recipe, config and params, the extrinsics resolved.
+        out: an existing folder.
+        start: first scan.
+        count: number of scans; None: to the end.
+        observers: called after each scan.
+
+    Raises:
+        LioJaxError: no scan could be read.
+    """
+    began = time.perf_counter()
+    step = CompiledStep(settings)
+    log = TrajectoryLog()
+    stage_ms: dict[str, list[float]] = {"decode": [], "pad": [], "step": [], "record": [], "total": []}
+    failures: list[dict[str, Any]] = []
+    interruption: BaseException | None = None
+    map_file = MapFile(out / "map.pcd") if settings.config.output.map else None
+    scans = prefetched(
+        _timed(sequence.scans(start, count), stage_ms["decode"]), settings.config.data.prefetch
+    )
+    try:
+        try:
+            for tracked in track(settings, scans, step):
+                recorded_from = time.perf_counter()
+                log.append(tracked)
+                if tracked.failure:
+                    failures.append(
+                        {
+                            "scan": start + tracked.index,
+                            "stamp_ns": tracked.stamp_ns,
+                            "message": tracked.failure,
+                        }
+                    )
+                if map_file:
+                    map_file.append(new_map_points(tracked))
+                for observer in observers:
+                    observer(tracked, tracked.stage_ms["total"])
+                for stage, value in tracked.stage_ms.items():
+                    stage_ms[stage].append(value)
+                stage_ms["record"].append((time.perf_counter() - recorded_from) * 1e3)
+        except (KeyboardInterrupt, Exception) as error:
+            interruption = error
+        if not len(log):
+            if interruption is not None:
+                raise interruption
+            raise LioJaxError(_nothing_read(sequence, start))
+        map_points = map_file.finish() if map_file else None
+        _write_trajectory(out, log, settings)
+    finally:
+        if map_file:
+            map_file.close()
+    metrics = {
+        "scans": len(log),
+        "scan_ms": {stage: _percentiles(values) for stage, values in stage_ms.items() if values},
+        "compile_s": round(step.compile_s, 4),
+        "wall_s": round(time.perf_counter() - began, 4),
+        "peak_rss_mb": round(peak_rss_mb(), 1),
+        "failures": failures,
+        "warnings": list(sequence.warnings_so_far),
+    }
+    write_json(out / "metrics.json", metrics)
+    return RunResult(log.trajectory(), metrics, stage_ms, map_points, interruption)
+
+
+def new_map_points(tracked: Tracked) -> NDArray[np.float32]:
+    """Return the (n, 3) points a scan added to the map, m in world."""
+    output = tracked.output
+    points = np.asarray(output.points)[np.asarray(output.added)]
+    return (points + np.asarray(output.origin)).astype(np.float32)
+
+
+def peak_rss_mb() -> float:
+    """Return the largest resident memory the process has had, MiB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)
+
+
+def _write_trajectory(out: Path, log: TrajectoryLog, settings: Settings) -> None:
+    trajectory = log.trajectory()
+    with atomic_path(out / "trajectory.tum") as aside:
+        write_tum(aside, trajectory)
+    with atomic_path(out / "trajectory_kitti.txt") as aside:
+        write_kitti_poses(aside, log.lidar_poses())
+    log.write_npz(out / "states.npz")
+    output = settings.config.output
+    chosen = keyframe_indices(trajectory.poses, output.keyframe_distance, output.keyframe_angle)
+    poses = trajectory.poses[chosen]
+    write_g2o(out / "keyframes.g2o", poses, odometry_edges(poses, log.column("covariance")[chosen]))
+    write_text(out / "config.yaml", settings.to_yaml())
+
+
+def _timed(scans: Iterator[LidarScan], decode_ms: list[float]) -> Iterator[LidarScan]:
+    while True:
+        start = time.perf_counter()
+        scan = next(scans, None)
+        if scan is None:
+            return
+        decode_ms.append((time.perf_counter() - start) * 1e3)
+        yield scan
+
+
+def _percentiles(values: list[float]) -> dict[str, float]:
+    median, p95, p99 = np.percentile(values, [50, 95, 99])
+    return {"median": round(median, 3), "p95": round(p95, 3), "p99": round(p99, 3)}
+
+
+def _nothing_read(sequence: Sequence, start: int) -> str:
+    info = sequence.info
+    if start >= info.scan_count > 0:
+        return f"{info.path}: has {info.scan_count} scans, so none from --start {start} on."
+    reasons = " ".join(sequence.warnings_so_far)
+    return f"{info.path}: no scan could be read. {reasons}".strip()

@@ -1,0 +1,127 @@
+"""Feed scans through a recipe's step, one by one, and bring each result back to the host."""
+
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from lio_jax.core.config import Config
+from lio_jax.core.params import Params
+from lio_jax.core.settings import Settings
+from lio_jax.data.sequence import LidarScan
+from lio_jax.recipes import recipe_named
+from lio_jax.registration.scan_to_map import CONVERGED
+from lio_jax.run.feed import padded
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """One scan's result on the host."""
+
+    index: int
+    """Position among the tracked scans."""
+    stamp_ns: int
+    """The scan's end: the instant of ``T_world_imu``."""
+    T_world_imu: NDArray[np.float64]
+    """(4, 4)."""
+    nav: Any
+    """The whole navigation state, numpy leaves."""
+    output: Any
+    """The recipe's output, numpy leaves."""
+    stage_ms: dict[str, float]
+    """pad: copying into padded arrays; step: transfer, estimation and the way back; total: their sum."""
+    failure: str
+    """What went wrong with this scan, or nothing."""
+
+
+class CompiledStep:
+    """A recipe's step, compiled once per scan size, with the compile time kept apart from the run time."""
+
+    def __init__(self, settings: Settings) -> None:
+        recipe = recipe_named(settings.recipe)
+        self.config: Config = settings.config
+        self.params: Params = settings.params()
+        self.compile_s = 0.0
+        self._init = jax.jit(partial(recipe.init, self.config))
+        self._step = jax.jit(partial(recipe.step, self.config), donate_argnums=1)
+        self._programs: dict[int, Any] = {}
+
+    def initial_state(self) -> Any:
+        """Return the recipe's state before the first scan."""
+        return self._init(self.params)
+
+    def __call__(self, state: Any, scan: Any) -> tuple[Any, Any]:
+        """Run one step; ``state`` is consumed."""
+        size = scan.points.shape[0]
+        if size not in self._programs:
+            start = time.perf_counter()
+            self._programs[size] = self._step.lower(self.params, state, scan).compile()
+            self.compile_s += time.perf_counter() - start
+        return self._programs[size](self.params, state, scan)
+
+
+def track(
+    settings: Settings, scans: Iterable[LidarScan], step: CompiledStep | None = None
+) -> Iterator[Tracked]:
+    """Yield the result of each scan in turn.
+
+    Args:
+        settings: recipe, config and params.
+        scans: in time order.
+        step: a compiled step of the same settings, to reuse its programs over several recordings.
+    """
+    step = step or CompiledStep(settings)
+    state = step.initial_state()
+    last_end_ns = None
+    for index, scan in enumerate(scans):
+        start = time.perf_counter()
+        arrays = padded(scan, last_end_ns, settings.config.lidar)
+        padded_at = time.perf_counter()
+        compiled_s = step.compile_s
+        state, output = step(state, arrays)
+        nav, result = jax.tree.map(np.array, (state.nav, output.registration))
+        lost = bool(output.lost)
+        done = time.perf_counter()
+        last_end_ns = scan.end_ns
+        pad_ms = (padded_at - start) * 1e3
+        step_ms = (done - padded_at - (step.compile_s - compiled_s)) * 1e3
+        yield Tracked(
+            index=index,
+            stamp_ns=scan.end_ns,
+            T_world_imu=pose_matrix(nav.T_world_imu.wxyz_xyz),
+            nav=nav,
+            output=output,
+            stage_ms={"pad": pad_ms, "step": step_ms, "total": pad_ms + step_ms},
+            failure=_failure(index, len(scan.points), result, lost, settings),
+        )
+
+
+def pose_matrix(wxyz_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the 4x4 matrix of a quaternion (w first) and a translation."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(wxyz_xyz[[1, 2, 3, 0]]).as_matrix()
+    pose[:3, 3] = wxyz_xyz[4:]
+    return pose
+
+
+def _failure(index: int, points: int, result: Any, lost: bool, settings: Settings) -> str:
+    if points == 0:
+        return f"scan {index}: holds no points; the pose is the constant-velocity prediction."
+    if lost:
+        needed = settings.values["registration"]["min_matches"]
+        return (
+            f"scan {index}: {int(result.matches)} points matched the map, {needed:g} are needed; "
+            "the pose is the constant-velocity prediction."
+        )
+    if result.status != CONVERGED and index > 0:
+        limit = settings.config.registration.max_iterations
+        return f"scan {index}: registration did not converge in {limit} iterations; its last pose was kept."
+    if index > 0 and (weak := int(result.degenerate.sum())):
+        return f"scan {index}: the scene leaves {weak} of 6 directions unobserved; there the prediction was kept."
+    return ""

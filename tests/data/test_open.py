@@ -1,0 +1,77 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lio_jax.core.errors import LioJaxError
+from lio_jax.data import open_sequence, write_native
+from tests.data.test_native import scans
+from tests.shared_data import SHARED_DATA, needs_shared
+
+
+@needs_shared
+@pytest.mark.parametrize(
+    ("path", "kind"),
+    [
+        ("kitti_odometry/sequences/04", "kitti_odometry"),
+        ("kitti_raw/2011_09_26/2011_09_26_drive_0060_sync", "kitti_raw"),
+        ("ouster/os1_128_3scans.bag", "rosbag"),
+    ],
+)
+def test_real_recordings_find_their_reader(path: str, kind: str) -> None:
+    sequence = open_sequence(SHARED_DATA / path)
+    assert sequence.info.format == kind
+    scan = next(sequence.scans())
+    assert len(scan.points) == len(scan.time) == len(scan.ring) == len(scan.intensity) > 50_000
+    assert scan.points.flags.c_contiguous
+    assert np.isfinite(scan.points).all()
+
+
+def test_a_native_folder_finds_its_reader(tmp_path: Path) -> None:
+    write_native(tmp_path / "s", scans(1))
+    assert open_sequence(str(tmp_path / "s")).info.format == "native"
+
+
+def test_nothing_there_is_an_error() -> None:
+    with pytest.raises(LioJaxError, match="no such file or folder"):
+        open_sequence("does/not/exist")
+
+
+def test_an_empty_folder_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(LioJaxError, match="the folder is empty"):
+        open_sequence(tmp_path)
+
+
+def test_an_unknown_file_is_an_error_that_says_what_was_looked_for(tmp_path: Path) -> None:
+    (tmp_path / "notes.pdf").write_text("hello")
+    with pytest.raises(LioJaxError, match=r"notes\.pdf: not a recording.*velodyne/\*\.bin.*\.mcap"):
+        open_sequence(tmp_path / "notes.pdf")
+
+
+def test_an_unknown_folder_is_an_error_that_says_what_was_looked_for(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(LioJaxError, match=r"layout is not known; looked for.*metadata\.yaml"):
+        open_sequence(tmp_path)
+
+
+def test_a_root_folder_names_the_sequences_inside(tmp_path: Path) -> None:
+    for name in ("00", "07"):
+        (tmp_path / "dataset" / "sequences" / name / "velodyne").mkdir(parents=True)
+    (tmp_path / "dataset" / "poses").mkdir()
+    with pytest.raises(LioJaxError, match="give one of those inside it: sequences/00, sequences/07"):
+        open_sequence(tmp_path / "dataset")
+
+
+def test_a_date_folder_names_the_drives_inside(tmp_path: Path) -> None:
+    (tmp_path / "2011_09_26_drive_0001_sync" / "velodyne_points").mkdir(parents=True)
+    (tmp_path / "calib_imu_to_velo.txt").write_text("")
+    with pytest.raises(LioJaxError, match="inside it: 2011_09_26_drive_0001_sync"):
+        open_sequence(tmp_path)
+
+
+@pytest.mark.parametrize("part", ["velodyne", "velodyne/000000.bin"])
+def test_a_part_of_a_recording_names_the_whole(tmp_path: Path, part: str) -> None:
+    (tmp_path / "04" / "velodyne").mkdir(parents=True)
+    (tmp_path / "04" / "velodyne" / "000000.bin").write_bytes(b"0" * 16)
+    with pytest.raises(LioJaxError, match=r"part of a recording; give the recording's folder, .*04\.$"):
+        open_sequence(tmp_path / "04" / part)
