@@ -3,7 +3,10 @@
 Exit status: 0 done; 1 the job failed; 2 wrong usage. Errors are one sentence; ``--debug`` adds the traceback.
 """
 
+import os
+import re
 import sys
+import traceback
 from pathlib import Path
 from typing import Annotated
 
@@ -16,13 +19,14 @@ Assignments = Annotated[
     tuple[str, ...],
     arg(name="set", metavar="PATH=VALUE ...", help="Replace settings, such as params.map.voxel_size=0.5."),
 ]
+Data = Positional[Annotated[Path, arg(metavar="DATA")]]
 Overwrite = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 app = tyro.extras.SubcommandApp()
 
 
 @app.command(name="demo")
-def demo(out: Path = Path("out/demo"), overwrite: Overwrite = False) -> None:
+def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("out/demo"), overwrite: Overwrite = False) -> None:
     """Simulate a street, run on it and compare with the truth.
 
     Args:
@@ -38,7 +42,7 @@ def demo(out: Path = Path("out/demo"), overwrite: Overwrite = False) -> None:
 
 @app.command(name="inspect")
 def inspect(
-    data: Positional[Path],
+    data: Data,
     set_: Assignments = (),
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> None:
@@ -55,13 +59,13 @@ def inspect(
 
 @app.command(name="run")
 def run(
-    data: Positional[Path],
-    out: Path,
-    recipe: str = "default",
+    data: Data,
+    out: Annotated[Path, arg(metavar="DIR")],
+    recipe: Annotated[str, arg(metavar="NAME|FILE.yaml")] = "default",
     set_: Assignments = (),
-    start: int = 0,
-    scans: int | None = None,
-    gt: Path | None = None,
+    start: Annotated[int, arg(metavar="N")] = 0,
+    scans: Annotated[int | None, arg(metavar="N")] = None,
+    gt: Annotated[Path | None, arg(metavar="FILE")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Estimate trajectory and map of a recording.
@@ -69,10 +73,10 @@ def run(
     Args:
         data: Recording: KITTI odometry sequence or raw drive, ROS 1 or ROS 2 bag, native folder.
         out: Folder for the results.
-        recipe: Recipe name or settings file (*.yaml).
+        recipe: Recipe or settings file; a run's config.yaml repeats that run.
         start: First scan.
-        scans: Number of scans; default: all.
-        gt: Ground truth (TUM, T_world_imu), where the recording holds none.
+        scans: How many scans; None means all.
+        gt: Ground truth of T_world_imu (TUM, run folder or recording); None means the recording's own.
         overwrite: Replace the results of an earlier run in that folder.
     """
     from lio_jax.commands.run import run as command
@@ -84,8 +88,8 @@ def run(
 
 @app.command(name="eval")
 def evaluate(
-    estimate: Positional[Path],
-    reference: Positional[Path],
+    estimate: Positional[Annotated[Path, arg(metavar="ESTIMATE")]],
+    reference: Positional[Annotated[Path, arg(metavar="REFERENCE")]],
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> None:
     """Compare a trajectory with a reference: ATE, RPE, KITTI segment errors.
@@ -104,46 +108,67 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
-    words = _gathered([word for word in words if word != "--debug"])
     try:
-        app.cli(args=words, prog="lio-jax", description="Differentiable LiDAR-inertial odometry.")
-    except LioJaxError as error:
-        if debug:
-            raise
-        print(f"lio-jax: {error}", file=sys.stderr)
-        return 2 if isinstance(error, UsageError) else 1
-    except KeyboardInterrupt:
-        if debug:
-            raise
-        print("lio-jax: interrupted before anything was computed.", file=sys.stderr)
-        return 1
+        words = _gathered([word for word in words if word != "--debug"])
+        app.cli(args=words, prog="lio-jax", description=_DESCRIPTION)
+        sys.stdout.flush()
     except SystemExit as leaving:
         return leaving.code if isinstance(leaving.code, int) else 2
-    except Exception as error:
-        if debug:
-            raise
-        reason = " ".join(str(error).split()) or "no reason given"
-        print(
-            f"lio-jax: unexpected {type(error).__name__}: {reason}; run again with --debug and report it.",
-            file=sys.stderr,
-        )
+    except BrokenPipeError:
+        # whoever read the output has seen enough; nothing may be left that flushes to the closed pipe at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except (KeyboardInterrupt, Exception) as error:
+        if debug:
+            traceback.print_exc()
+        else:
+            print(f"lio-jax: {_sentence(error)}", file=sys.stderr)
+        return 2 if isinstance(error, UsageError) else 1
     return 0
 
 
+_DESCRIPTION = (
+    "Differentiable LiDAR-inertial odometry. Add --debug to any command for the traceback of an error."
+)
+
+
+def _sentence(error: BaseException) -> str:
+    if isinstance(error, LioJaxError):
+        return str(error)
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted before the job was done."
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}; check the path, its permissions and the free space."
+    reason = " ".join(str(error).split()) or "no reason given"
+    return f"unexpected {type(error).__name__}: {reason}; run again with --debug and report it."
+
+
 def _gathered(words: list[str]) -> list[str]:
-    """Move all ``--set`` assignments behind one ``--set`` at the end, so that it may be repeated anywhere."""
+    """Move all ``--set`` assignments behind one ``--set`` at the end, so that it may be repeated anywhere.
+
+    What follows ``--set`` is an assignment, and so is each further word of the form NAME=VALUE.
+
+    Raises:
+        UsageError: a ``--set`` is followed by nothing.
+    """
     rest: list[str] = []
     assignments: list[str] = []
-    taking = False
+    first = further = False
     for word in words:
-        if word == "--set":
-            taking = True
-        elif taking and not word.startswith("--") and "=" in word:
+        if first and word.startswith("--"):
+            break
+        if word == "--set" or word.startswith("--set="):
+            _, joined, value = word.partition("=")
+            assignments += [value] if joined else []
+            first, further = not joined, bool(joined)
+        elif first or (further and re.match(r"[\w.]+=", word)):
             assignments.append(word)
+            first, further = False, True
         else:
-            taking = False
+            further = False
             rest.append(word)
+    if first:
+        raise UsageError("--set: nothing follows it; write for example --set params.map.voxel_size=0.5.")
     return rest + (["--set", *assignments] if assignments else [])
 
 

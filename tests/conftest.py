@@ -1,9 +1,19 @@
-"""Numerics settings shared by all tests."""
+"""Numerics settings and run-time shape checks shared by all tests."""
 
 import os
 
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=true")
 
 import jax
+from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
+
+# Before any import of these modules: the shapes and dtypes of every call are checked in the tests. Left out:
+# lio_jax.core.types, because the runner fills a Scan with numpy arrays, and the host-side packages, because
+# their protocols are not runtime_checkable.
+_CHECKED = (
+    "core.config core.files core.fusion core.geometry core.hashing core.params core.settings "
+    "imu lidar mapping registration estimation loops recipes sim"
+)
+install_import_hook([f"lio_jax.{name}" for name in _CHECKED.split()], "beartype.beartype")

@@ -71,6 +71,7 @@ def _options() -> argparse.Namespace:
         default=",".join((OURS, *PEER_NAMES[:2])),
         help=f"comma separated, of: {OURS}, {', '.join(PEER_NAMES)}",
     )
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="settings of ours")
     parser.add_argument("--repeats", type=int, default=1, help="passes over each recording")
     parser.add_argument(
         "--interleave", choices=("scan", "pass"), default="scan", help="how systems take turns"
@@ -98,13 +99,15 @@ def _datasets(options: argparse.Namespace) -> "list[Dataset]":
 
 
 def _factories(options: argparse.Namespace, dataset: "Dataset") -> "dict[str, Callable[[], System]]":
-    from lio_jax_system import LioJaxSystem
     from systems import PEERS
 
     makers: dict[str, Callable[[], System]] = {
         name: partial(maker, options.threads) for name, maker in PEERS.items()
     }
-    makers[OURS] = partial(LioJaxSystem, options.threads, dataset.T_imu_lidar)
+    if OURS in options.systems:
+        from lio_jax_system import LioJaxSystem
+
+        makers[OURS] = partial(LioJaxSystem, options.threads, dataset.T_imu_lidar, tuple(options.set))
     return {name: makers[name] for name in options.systems}
 
 

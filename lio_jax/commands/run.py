@@ -80,17 +80,15 @@ def run_and_report(
         bar = stack.enter_context(tqdm(total=total, unit="scan", disable=None, leave=False))
         observers.append(lambda tracked, scan_ms: _advance(bar))
         result = run_sequence(sequence, settings, out, start, count, observers)
+        if isinstance(result.interruption, KeyboardInterrupt):
+            say("interrupted: finishing the files of what was computed ...")
         if recording and result.map_points is not None:
             recording.log_map(result.map_points)
         if recording and truth is not None:
             recording.log_truth(_in_world_of(result.trajectory, truth).positions)
     evaluation_text = _finish(result, truth, settings, out, info.name)
-    for warning in sequence.warnings_so_far:
-        say(f"warning: {warning}")
-    for failure in result.metrics["failures"][:_FAILURES_SHOWN]:
-        say(f"warning: {failure['message']}")
-    if (hidden := len(result.metrics["failures"]) - _FAILURES_SHOWN) > 0:
-        say(f"warning: {hidden} more of these; metrics.json lists them all.")
+    _warn(result.metrics["warnings"])
+    _warn([failure["message"] for failure in result.metrics["failures"]])
     print(_summary(result, out), end="\n\n" if evaluation_text else "\n")
     if evaluation_text:
         print(evaluation_text)
@@ -98,7 +96,14 @@ def run_and_report(
     return result
 
 
-_FAILURES_SHOWN = 5
+_WARNINGS_SHOWN = 5
+
+
+def _warn(sentences: list[str]) -> None:
+    for sentence in sentences[:_WARNINGS_SHOWN]:
+        say(f"warning: {sentence}")
+    if (hidden := len(sentences) - _WARNINGS_SHOWN) > 0:
+        say(f"warning: {hidden} more of these; metrics.json lists them all.")
 
 
 class RecordingObserver:
@@ -202,7 +207,7 @@ def _raise_if_interrupted(result: RunResult, out: Path) -> None:
         return
     done = f"the first {result.metrics['scans']} scans are in {out}"
     if isinstance(error, KeyboardInterrupt):
-        raise LioJaxError(f"interrupted; {done}.")
+        raise LioJaxError(f"interrupted; {done}.") from error
     if isinstance(error, LioJaxError):
-        raise LioJaxError(f"{error} The run ended early; {done}.")
+        raise LioJaxError(f"{error} The run ended early; {done}.") from error
     raise error

@@ -8,8 +8,8 @@ from pathlib import Path
 def prepare_jax() -> None:
     """Turn on double precision and the persistent compilation cache.
 
-    The cache lies in $LIO_JAX_CACHE, else $XDG_CACHE_HOME/lio_jax, else ~/.cache/lio_jax; where it cannot be written
-    programs are compiled anew each time.
+    The cache lies in $LIO_JAX_CACHE, else $XDG_CACHE_HOME/lio_jax, else ~/.cache/lio_jax; where it cannot be
+    written programs are compiled anew each time.
     """
     import jax
 

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.geometry import inverse3, largest_eigenvalue3, symmetric3
@@ -14,6 +15,14 @@ from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, query_nearest
 
 CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES = 0, 1, 2
 """Status codes of a solve."""
+
+
+_JACOBIAN = np.zeros((3, 6, 4))
+for _axis in range(3):
+    _next, _last = (_axis + 1) % 3, (_axis + 2) % 3
+    _JACOBIAN[_axis, _next, 1 + _last], _JACOBIAN[_axis, _last, 1 + _next] = 1.0, -1.0
+    _JACOBIAN[_axis, 3 + _axis, 0] = 1.0
+"""d error_m / d step_c = sum_i _JACOBIAN[m, c, i] (1, arm)_i, for error = turn x arm + move."""
 
 
 class Registration(eqx.Module):
@@ -84,26 +93,26 @@ def linearise(
     used = mask & near.valid
     weight = jnp.where(used, (kernel_squared / (kernel_squared + distance_squared)) ** 2, 0.0)
 
-    x, y, z = jnp.moveaxis(arm, -1, 0)
-    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
-    jacobian = jnp.stack(
-        [
-            jnp.stack([zero, z, -y, one, zero, zero, error[:, 0]], -1),
-            jnp.stack([-z, zero, x, zero, one, zero, error[:, 1]], -1),
-            jnp.stack([y, -x, zero, zero, zero, one, error[:, 2]], -1),
-        ],
-        1,
-    )
-    weighted = weight[:, None, None] * jnp.sum(precision[..., None] * jacobian[:, None], 2)
-    gram = (jacobian.reshape(-1, 7).T @ weighted.reshape(-1, 7)).astype(dtype)
+    # With h = (1, arm) the 3x6 Jacobian of a point is linear in h, so the normal equations are sums over the
+    # points of h_i h_j W_mn and h_i (W e)_m: one matrix product gives these and every other sum.
+    h = jnp.concatenate([jnp.ones_like(arm[:, :1]), arm], -1)
+    pairs = (h[:, :, None] * h[:, None, :]).reshape(-1, 16)
+    columns = [
+        (weight[:, None, None] * precision).reshape(-1, 9),
+        weight[:, None] * weighted_error,
+        jnp.stack([used.astype(jnp.float32), weight, weight * distance_squared], -1),
+    ]
+    sums = (pairs.T @ jnp.concatenate(columns, -1)).astype(dtype).reshape(4, 4, 15)
+    jacobian = jnp.asarray(_JACOBIAN, dtype)
+    hessian = jnp.einsum("mci,ndj,ijmn->cd", jacobian, jacobian, sums[:, :, :9].reshape(4, 4, 3, 3))
+    matches, weight_sum, squared_error = sums[0, 0, 12:]
     return NormalEquations(
-        hessian=(gram[:6, :6] + gram[:6, :6].T) / 2,
-        gradient=gram[:6, 6],
-        matches=jnp.sum(used, dtype=jnp.int32),
-        weight=jnp.sum(weight).astype(dtype),
-        squared_error=jnp.sum(weight * distance_squared).astype(dtype),
-        arm_squared=jnp.sum(jnp.where(used, jnp.sum(arm**2, -1), 0.0)).astype(dtype)
-        / jnp.maximum(jnp.sum(used), 1),
+        hessian=(hessian + hessian.T) / 2,
+        gradient=jnp.einsum("mci,im->c", jacobian, sums[0, :, 9:12]),
+        matches=matches.astype(jnp.int32),
+        weight=weight_sum,
+        squared_error=squared_error,
+        arm_squared=jnp.trace(sums[1:, 1:, 12]) / jnp.maximum(matches, 1.0),
     )
 
 

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.loops.g2o import Edge
+from lio_jax.run.covariance import carried
 
 
 def keyframe_indices(poses: NDArray[np.float64], distance: float, angle: float) -> list[int]:
@@ -31,21 +32,13 @@ def odometry_edges(poses: NDArray[np.float64], covariances: NDArray[np.float64])
 
     Args:
         poses: (n, 4, 4).
-        covariances: (n, 6, 6) of each pose's right perturbation, rotation before translation; NaN where unknown.
+        covariances: (n, 6, 6) of each pose's right perturbation, rotation first; NaN where unknown.
     """
     loose = np.diag([1e2] * 3 + [1.0] * 3)
     edges = []
     for i in range(len(poses) - 1):
         T_i_j = np.linalg.inv(poses[i]) @ poses[i + 1]
-        carried = _adjoint(np.linalg.inv(T_i_j))
-        covariance = covariances[i + 1] + carried @ covariances[i] @ carried.T
+        covariance = covariances[i + 1] + carried(covariances[i], np.linalg.inv(T_i_j))
         known = np.isfinite(covariance).all()
         edges.append(Edge(i, i + 1, T_i_j, np.linalg.inv(covariance) if known else loose))
     return edges
-
-
-def _adjoint(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the adjoint that acts on (rotation, translation)."""
-    rotation, (x, y, z) = T[:3, :3], T[:3, 3]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.block([[rotation, np.zeros((3, 3))], [cross @ rotation, rotation]])

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from lio_jax.core.files import atomic_path
 
+_POINT_BYTES = 3 * np.dtype(np.float32).itemsize
+
 
 class MapFile:
     """Points new to the map are appended to a spool file and become a PCD at the end."""
@@ -26,7 +28,9 @@ class MapFile:
         from pypcd4 import Encoding, PointCloud
 
         self._spool.close()
-        points = np.fromfile(self._spool_path, np.float32).reshape(-1, 3)
+        # an interrupted append may have left part of a point behind
+        whole = self._spool_path.stat().st_size // _POINT_BYTES
+        points = np.fromfile(self._spool_path, np.float32, 3 * whole).reshape(-1, 3)
         with atomic_path(self._path) as aside:
             PointCloud.from_xyz_points(points).save(aside, encoding=Encoding.BINARY)
         return points

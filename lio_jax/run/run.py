@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Iterator
 from collections.abc import Sequence as Listing
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -22,6 +23,7 @@ from lio_jax.loops.g2o import write_g2o
 from lio_jax.run.folder import write_json, write_text
 from lio_jax.run.keyframes import keyframe_indices, odometry_edges
 from lio_jax.run.map_file import MapFile
+from lio_jax.run.overflow import Overflow
 from lio_jax.run.track import CompiledStep, Tracked, track
 from lio_jax.run.trajectory_log import TrajectoryLog
 
@@ -55,7 +57,8 @@ def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list
     """Take T_imu_lidar from the recording's calibration unless it was given; say where it came from."""
     given = any(path.startswith("params.extrinsics") for path in settings.given)
     if given:
-        return settings, ["T_imu_lidar: as given in the settings."]
+        unused = "" if sequence.info.T_imu_lidar is None else "; the recording's calibration is not used"
+        return settings, [f"T_imu_lidar: as given in the settings{unused}."]
     if sequence.info.T_imu_lidar is None:
         return settings, ["T_imu_lidar: not in the recording; taken as identity (set params.extrinsics.*)."]
     settings = with_extrinsics(settings, sequence.info.T_imu_lidar, sequence.info.path)
@@ -90,31 +93,28 @@ def run_sequence(
     log = TrajectoryLog()
     stage_ms: dict[str, list[float]] = {"decode": [], "pad": [], "step": [], "record": [], "total": []}
     failures: list[dict[str, Any]] = []
+    overflow = Overflow(settings)
     interruption: BaseException | None = None
     map_file = MapFile(out / "map.pcd") if settings.config.output.map else None
-    scans = prefetched(
-        _timed(sequence.scans(start, count), stage_ms["decode"]), settings.config.data.prefetch
-    )
+    decoded = _timed(sequence.scans(start, count), stage_ms["decode"])
+    scans: Any = prefetched(decoded, settings.config.data.prefetch)
     try:
         try:
-            for tracked in track(settings, scans, step):
-                recorded_from = time.perf_counter()
-                log.append(tracked)
-                if tracked.failure:
-                    failures.append(
-                        {
-                            "scan": start + tracked.index,
-                            "stamp_ns": tracked.stamp_ns,
-                            "message": tracked.failure,
-                        }
-                    )
-                if map_file:
-                    map_file.append(new_map_points(tracked))
-                for observer in observers:
-                    observer(tracked, tracked.stage_ms["total"])
-                for stage, value in tracked.stage_ms.items():
-                    stage_ms[stage].append(value)
-                stage_ms["record"].append((time.perf_counter() - recorded_from) * 1e3)
+            # closing: an observer that raises must not leave the decoding thread and its files behind
+            with closing(scans):
+                for tracked in track(settings, scans, step):
+                    recorded_from = time.perf_counter()
+                    for stage, value in tracked.stage_ms.items():
+                        stage_ms[stage].append(value)
+                    overflow.add(tracked)
+                    log.append(tracked)
+                    if tracked.failure:
+                        failures.append(_failure(start + tracked.index, tracked))
+                    if map_file:
+                        map_file.append(new_map_points(tracked))
+                    for observer in observers:
+                        observer(tracked, tracked.stage_ms["total"])
+                    stage_ms["record"].append((time.perf_counter() - recorded_from) * 1e3)
         except (KeyboardInterrupt, Exception) as error:
             interruption = error
         if not len(log):
@@ -133,7 +133,8 @@ def run_sequence(
         "wall_s": round(time.perf_counter() - began, 4),
         "peak_rss_mb": round(peak_rss_mb(), 1),
         "failures": failures,
-        "warnings": list(sequence.warnings_so_far),
+        "warnings": [*sequence.warnings_so_far, *overflow.warnings()],
+        "overflow": overflow.metrics(),
     }
     write_json(out / "metrics.json", metrics)
     return RunResult(log.trajectory(), metrics, stage_ms, map_points, interruption)
@@ -174,6 +175,11 @@ def _timed(scans: Iterator[LidarScan], decode_ms: list[float]) -> Iterator[Lidar
             return
         decode_ms.append((time.perf_counter() - start) * 1e3)
         yield scan
+
+
+def _failure(number: int, tracked: Tracked) -> dict[str, Any]:
+    message = f"scan {number}: {tracked.failure}"
+    return {"scan": number, "stamp_ns": tracked.stamp_ns, "message": message}
 
 
 def _percentiles(values: list[float]) -> dict[str, float]:

@@ -16,8 +16,8 @@ from lio_jax.core.params import Params
 from lio_jax.core.settings import Settings
 from lio_jax.data.sequence import LidarScan
 from lio_jax.recipes import recipe_named
-from lio_jax.registration.scan_to_map import CONVERGED
-from lio_jax.run.feed import padded
+from lio_jax.registration.scan_to_map import CONVERGED, ITERATION_LIMIT
+from lio_jax.run.feed import bucket_for, padded
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,9 @@ class Tracked:
     nav: Any
     """The whole navigation state, numpy leaves."""
     output: Any
-    """The recipe's output, numpy leaves."""
+    """The recipe's output, still on the device."""
+    scan_points: int
+    """Points of the scan as it was recorded."""
     stage_ms: dict[str, float]
     """pad: copying into padded arrays; step: transfer, estimation and the way back; total: their sum."""
     failure: str
@@ -78,17 +80,21 @@ def track(
     """
     step = step or CompiledStep(settings)
     state = step.initial_state()
-    last_end_ns = None
+    last_end_ns, last_count, size = None, 0, 0
     for index, scan in enumerate(scans):
         start = time.perf_counter()
-        arrays = padded(scan, last_end_ns, settings.config.lidar)
+        count = len(scan.points)
+        # an empty or torn scan among whole ones is not worth compiling a program of its own size
+        if count >= _STRAGGLER * last_count:
+            size = bucket_for(count, settings.config.lidar)
+        arrays = padded(scan, last_end_ns, settings.config.lidar, size)
         padded_at = time.perf_counter()
         compiled_s = step.compile_s
         state, output = step(state, arrays)
         nav, result = jax.tree.map(np.array, (state.nav, output.registration))
         lost = bool(output.lost)
         done = time.perf_counter()
-        last_end_ns = scan.end_ns
+        last_end_ns, last_count = scan.end_ns, count
         pad_ms = (padded_at - start) * 1e3
         step_ms = (done - padded_at - (step.compile_s - compiled_s)) * 1e3
         yield Tracked(
@@ -97,9 +103,14 @@ def track(
             T_world_imu=pose_matrix(nav.T_world_imu.wxyz_xyz),
             nav=nav,
             output=output,
+            scan_points=count,
             stage_ms={"pad": pad_ms, "step": step_ms, "total": pad_ms + step_ms},
-            failure=_failure(index, len(scan.points), result, lost, settings),
+            failure=_failure(count, result, lost, settings),
         )
+
+
+_STRAGGLER = 0.25
+"""A scan with less than this share of the points of the scan before keeps that one's padded size."""
 
 
 def pose_matrix(wxyz_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -110,18 +121,19 @@ def pose_matrix(wxyz_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     return pose
 
 
-def _failure(index: int, points: int, result: Any, lost: bool, settings: Settings) -> str:
+def _failure(points: int, result: Any, lost: bool, settings: Settings) -> str:
     if points == 0:
-        return f"scan {index}: holds no points; the pose is the constant-velocity prediction."
+        return "it holds no points; the pose is the constant-velocity prediction."
     if lost:
         needed = settings.values["registration"]["min_matches"]
         return (
-            f"scan {index}: {int(result.matches)} points matched the map, {needed:g} are needed; "
+            f"{int(result.matches)} points matched the map, {needed:g} are needed; "
             "the pose is the constant-velocity prediction."
         )
-    if result.status != CONVERGED and index > 0:
+    if result.status == ITERATION_LIMIT:
         limit = settings.config.registration.max_iterations
-        return f"scan {index}: registration did not converge in {limit} iterations; its last pose was kept."
-    if index > 0 and (weak := int(result.degenerate.sum())):
-        return f"scan {index}: the scene leaves {weak} of 6 directions unobserved; there the prediction was kept."
+        return f"registration did not converge in {limit} iterations; its last pose was kept."
+    # too few matches without being lost: the scan that starts the map
+    if result.status == CONVERGED and (weak := int(result.degenerate.sum())):
+        return f"the scene leaves {weak} of 6 directions unobserved; there the prediction was kept."
     return ""

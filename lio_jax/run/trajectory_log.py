@@ -1,12 +1,14 @@
 """What a run keeps of every scan: the navigation state and its covariance, small enough for any length."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.files import atomic_path
 from lio_jax.data.trajectory import Trajectory
+from lio_jax.run.covariance import carried, covariance_of
 from lio_jax.run.track import Tracked, pose_matrix
 
 
@@ -14,7 +16,7 @@ class TrajectoryLog:
     """States in the order of the scans."""
 
     def __init__(self) -> None:
-        self._rows: list[dict[str, NDArray]] = []
+        self._rows: list[dict[str, Any]] = []
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -31,7 +33,7 @@ class TrajectoryLog:
                 "accel_bias": nav.accel_bias,
                 "gravity": nav.gravity,
                 "extrinsic": pose_matrix(nav.T_imu_lidar.wxyz_xyz),
-                "covariance": _covariance(np.asarray(tracked.output.registration.information)),
+                "covariance": _covariance(tracked) if self._rows else np.zeros((6, 6)),
             }
         )
 
@@ -48,15 +50,19 @@ class TrajectoryLog:
         return self.column("poses") @ self.column("extrinsic")
 
     def write_npz(self, path: Path) -> None:
-        """Write every column; ``covariance`` is that of rotation and position (rad, m), NaN where unknown."""
+        """Write every column.
+
+        ``covariance`` is that of the pose's right perturbation (rotation rad, position m) by the match with
+        the map alone: zero for the first pose, which is the world's origin, NaN where unknown.
+        """
         with atomic_path(path) as aside:
-            np.savez_compressed(aside, **{name: self.column(name) for name in self._rows[0]})
+            columns: dict[str, Any] = {name: self.column(name) for name in self._rows[0]}
+            np.savez_compressed(aside, **columns)
 
 
-def _covariance(information: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Invert a scan match's information; NaN where a direction is unobserved."""
-    try:
-        root = np.linalg.inv(np.linalg.cholesky(information))
-    except np.linalg.LinAlgError:
-        return np.full((6, 6), np.nan)
-    return root.T @ root
+def _covariance(tracked: Tracked) -> NDArray[np.float64]:
+    """Carry the scan match's covariance from the lidar to the IMU at the scan's end."""
+    registration = tracked.output.registration
+    T_world_lidar = pose_matrix(np.asarray(registration.T_world_lidar.wxyz_xyz))
+    T_imu_lidar = np.linalg.inv(tracked.T_world_imu) @ T_world_lidar
+    return carried(covariance_of(np.asarray(registration.information)), T_imu_lidar)

@@ -126,7 +126,7 @@ def _nearest(
     count = primitives.reflectivity.shape[0]
     start = (jnp.full(rays.x.shape, jnp.inf, rays.x.dtype), jnp.zeros(rays.x.shape, jnp.int32))
     items = (jnp.arange(count, dtype=jnp.int32), primitives)
-    return jax.lax.scan(closer_of, start, items, unroll=min(4, count))[0]
+    return jax.lax.scan(closer_of, start, items, unroll=min(8, count))[0]
 
 
 def _away_from_zero(value: Float[Array, " n"]) -> Float[Array, " n"]:

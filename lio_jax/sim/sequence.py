@@ -136,7 +136,7 @@ class SimulatedSequence:
         positions = self.poses(np.arange(int(duration) + 2) * 1.0)[:, :3, 3].astype(np.float32)
         # positions are sampled once a second: the margin covers what is driven in between
         radius = float(self.lidar.max_range) + 15.0
-        counts = np.asarray(_all_counts(self.world, jnp.asarray(positions), radius)).max(axis=0)
+        counts = np.asarray(_all_counts(self.world, jnp.asarray(positions), jnp.float32(radius))).max(axis=0)
         return int(counts[0]), int(counts[1])
 
 
@@ -146,7 +146,7 @@ def _poses(drive: Drive, times: Float[Array, " n"]) -> jaxlie.SE3:
 
 
 @jax.jit
-def _all_counts(world: World, positions: Float[Array, "n 3"], radius: float) -> Array:
+def _all_counts(world: World, positions: Float[Array, "n 3"], radius: Float[Array, ""]) -> Array:
     return jax.vmap(lambda position: counts_within(world, position, radius))(positions)
 
 

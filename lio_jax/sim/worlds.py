@@ -84,7 +84,9 @@ def nearest_part(
     return part, jnp.minimum(box_reach, cylinder_reach)
 
 
-def counts_within(world: World, position: Float[Array, "3"], radius: float) -> Int[Array, "2"]:
+def counts_within(
+    world: World, position: Float[Array, "3"], radius: float | Float[Array, ""]
+) -> Int[Array, "2"]:
     """Count the boxes and cylinders that reach into the horizontal circle of ``radius`` m at ``position``."""
     boxes = jnp.sum(_box_gap(world.boxes, position) < radius)
     cylinders = jnp.sum(_cylinder_gap(world.cylinders, position) < radius)

@@ -1,0 +1,65 @@
+"""A file appears whole or not at all."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from lio_jax.core.files import atomic_path
+
+
+def test_file_appears_when_the_block_ends(tmp_path):
+    target = tmp_path / "trajectory.tum"
+    with atomic_path(target) as aside:
+        aside.write_text("first")
+        assert not target.exists()
+        assert aside.parent == tmp_path
+    assert target.read_text() == "first"
+    assert os.listdir(tmp_path) == ["trajectory.tum"]
+
+
+def test_temporary_keeps_the_suffix(tmp_path):
+    with atomic_path(tmp_path / "states.npz") as aside:
+        assert aside.suffix == ".npz"
+        aside.touch()
+
+
+def test_old_file_stays_until_the_new_one_is_whole(tmp_path):
+    target = tmp_path / "metrics.json"
+    target.write_text("old")
+    with atomic_path(target) as aside:
+        aside.write_text("new")
+        assert target.read_text() == "old"
+    assert target.read_text() == "new"
+
+
+def write_half(target: Path, error: type[BaseException]) -> None:
+    with atomic_path(target) as aside:
+        aside.write_text("half")
+        raise error
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_failure_leaves_no_file(tmp_path, error):
+    with pytest.raises(error):
+        write_half(tmp_path / "map.pcd", error)
+    assert os.listdir(tmp_path) == []
+
+
+def test_failure_leaves_the_old_file_as_it_was(tmp_path):
+    target = tmp_path / "map.pcd"
+    target.write_text("old")
+    with pytest.raises(RuntimeError):
+        write_half(target, RuntimeError)
+    assert os.listdir(tmp_path) == ["map.pcd"]
+    assert target.read_text() == "old"
+
+
+def test_two_writers_of_one_file_do_not_share_a_temporary(tmp_path):
+    target = tmp_path / "config.yaml"
+    with atomic_path(target) as one, atomic_path(target) as two:
+        assert one != two
+        one.write_text("one")
+        two.write_text("two")
+    assert target.read_text() == "one"
+    assert os.listdir(tmp_path) == ["config.yaml"]
