@@ -7,6 +7,8 @@ os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=true")
 import jax
 from jaxtyping import install_import_hook
 
+from tests import type_checker
+
 jax.config.update("jax_enable_x64", True)
 
 # Before any import of these modules: the shapes and dtypes of every call are checked in the tests. Left out:
@@ -16,4 +18,4 @@ _CHECKED = (
     "core.config core.files core.fusion core.geometry core.hashing core.params core.settings "
     "imu lidar mapping registration estimation loops recipes sim"
 )
-install_import_hook([f"lio_jax.{name}" for name in _CHECKED.split()], "beartype.beartype")
+install_import_hook([f"lio_jax.{name}" for name in _CHECKED.split()], f"{type_checker.__name__}.checked")

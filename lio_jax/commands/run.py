@@ -171,7 +171,8 @@ def _finish(result: RunResult, truth: Trajectory | None, settings: Settings, out
         from lio_jax.viz.plot import plot_timings, plot_trajectory
 
         plot_trajectory(out / "trajectory.png", result.trajectory, truth, name)
-        plot_timings(out / "timings.png", {k: v for k, v in result.stage_ms.items() if v})
+        stages = {name: ms for name, ms in result.stage_ms.items() if ms and name != "total"}
+        plot_timings(out / "timings.png", stages)
     return text
 
 

@@ -16,7 +16,7 @@ class DataConfig:
     imu_topic: str = ""
     """Bag topic of the inertial samples; empty: the one with most messages."""
     gps_topic: str = ""
-    """Bag topic of NavSatFix or Odometry used as GPS; empty: NavSatFix, or an Odometry named gps, gnss or rtk."""
+    """Bag topic used as GPS; empty: a NavSatFix, or an Odometry whose name holds gps, gnss or rtk."""
     time_field: str = ""
     """Name of the per-point time field; empty: t, time, timestamp, time_stamp, offset_time or timeOffset."""
     time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
@@ -32,7 +32,7 @@ class DataConfig:
     vertical_correction_deg: float = 0.205
     """Correction of the HDL-64E's elevation angles, applied to KITTI odometry scans only, deg."""
     beams: int = 0
-    """Number of beams for ring reconstruction where the recording holds no ring; 0: 16, 32 or 64 by the data."""
+    """Beams for ring reconstruction where the recording holds no ring; 0: 16, 32 or 64 by the data."""
     scan_period: float = 0.1
     """Duration of one sweep where it cannot be read from the data, s."""
     prefetch: int = 3
@@ -44,7 +44,7 @@ class LidarConfig:
     """Capacities of the scan's arrays."""
 
     buckets: tuple[int, ...] = (4096, 8192, 16384, 32768, 65536, 98304, 131072, 196608, 262144)
-    """Padded scan sizes; a scan takes the smallest that holds it, a larger scan is thinned evenly to the last."""
+    """Padded scan sizes; a scan takes the smallest that holds it, a larger one is thinned to the last."""
     registration_points: int = 4096
     """Capacity of the downsampled scan that is registered."""
     insertion_points: int = 16384

@@ -65,7 +65,7 @@ class MotionParams(eqx.Module):
     initial_error: Scalar
     """How far off the prediction may be before any velocity is known, m: it opens the robust kernel."""
     error_decay: Scalar
-    """Fraction of the last expected prediction error that is kept when predictions turn out better, 0 to 1."""
+    """Share of the last expected prediction error kept when predictions turn out better, 0 to 1."""
 
 
 class ExtrinsicsParams(eqx.Module):
@@ -109,7 +109,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
 }
 """Values of the default recipe in the units of the leaves above."""
 
-_SECTIONS = {f.name: f.type for f in dataclasses.fields(Params)}
+_SECTIONS: dict[str, Any] = {f.name: f.type for f in dataclasses.fields(Params)}
 
 
 def params_from_values(values: dict[str, dict[str, Any]]) -> Params:

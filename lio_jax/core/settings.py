@@ -43,7 +43,7 @@ class Settings:
         """Return a copy with the value at a path such as ``config.map.capacity`` replaced.
 
         Raises:
-            UsageError: the path is not known (names the nearest), or the value has the wrong type or is impossible.
+            UsageError: the path is not known (names the nearest), or the value is impossible there.
         """
         place = f"{source}: {path}"
         if path == "recipe":
@@ -95,7 +95,7 @@ def settings_from_yaml(text: str, source: str, base: Settings | None = None) -> 
         base: settings that hold where the text says nothing.
 
     Raises:
-        UsageError: not YAML, an unknown key, a wrong type or an impossible value; the message names file and key.
+        UsageError: not YAML, an unknown key or an impossible value; the message names file and key.
     """
     try:
         tree = yaml.safe_load(text)
@@ -116,8 +116,10 @@ def load_settings(path: Path, base: Settings | None = None) -> Settings:
     """Read a settings file; see :func:`settings_from_yaml`."""
     try:
         text = path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: cannot be read as a settings file ({error}).") from None
+    except OSError as error:
+        raise UsageError(f"{path}: the settings file cannot be read ({error.strerror}).") from None
+    except UnicodeDecodeError:
+        raise UsageError(f"{path}: is not a text file; give a YAML settings file.") from None
     return settings_from_yaml(text, str(path), base)
 
 

@@ -110,5 +110,5 @@ class Sequence(Protocol):
 
     @property
     def warnings_so_far(self) -> tuple[str, ...]:
-        """Return one sentence for each problem met while decoding up to now (missing, empty, unreadable scan)."""
+        """Return one sentence for each problem met so far (missing, empty, unreadable scan)."""
         ...

@@ -21,10 +21,10 @@ def select_per_voxel(
 ) -> Selection:
     """Select at most one point of each cubic voxel, at most ``capacity`` in all.
 
-    Every point writes a scrambled copy of its index into the slot its voxel hashes to and the largest one stays, so
-    which point represents a voxel is a fixed pseudo-random choice. Two voxels that share a slot lose one of
-    them, and slots beyond the capacity are cut off; both thin the scan evenly over space, because slots are
-    hashes. Indices carry no gradient.
+    Every point writes a scrambled copy of its index into the slot its voxel hashes to and the largest one
+    stays, so which point represents a voxel is a fixed pseudo-random choice. Two voxels that share a slot
+    lose one of them, and slots beyond the capacity are cut off; both thin the scan evenly over space, because
+    slots are hashes. Indices carry no gradient.
 
     Args:
         points: m, any frame.

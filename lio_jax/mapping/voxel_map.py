@@ -119,8 +119,8 @@ def insert(
     """Add points to the distributions of their voxels.
 
     A point is taken if its cell is still empty, which keeps a distribution even where the sensor's lines are
-    not. A new voxel claims a slot that is free or holds a voxel farther than ``reach`` from the anchor: that is how
-    the map forgets.
+    not. A new voxel claims a slot that is free or holds a voxel farther than ``reach`` from the anchor: that
+    is how the map forgets.
 
     Args:
         vmap: donate it where it is not needed afterwards.

@@ -6,7 +6,8 @@ from lio_jax.core.errors import UsageError
 from lio_jax.recipes import default
 
 RECIPES: dict[str, ModuleType] = {"default": default}
-"""By name; each module has ``State``, ``Output``, ``init(config, params)`` and ``step(config, params, state, scan, imu)``."""
+"""By name; each module has State, Output, init(config, params), step(config, params, state, scan, imu) and
+restart(config, params, state)."""
 
 
 def recipe_named(name: str) -> ModuleType:

@@ -55,19 +55,33 @@ class Output(eqx.Module):
     """Points whose voxel found no room in the map."""
 
 
-def init(config: Config, params: Params) -> State:
-    """Return the state before the first scan: at rest at the world's origin, with an empty map."""
+def init(config: Config, params: Params, twist: Float[Array, "6"] | None = None) -> State:
+    """Return the state before the first scan: at the world's origin, with an empty map.
+
+    Args:
+        config: static.
+        params: traced.
+        twist: velocity of the lidar in its own frame, m/s then rad/s; None: at rest.
+    """
     nav = initial_nav_state(params.extrinsics.T_imu_lidar())
     dtype = nav.velocity.dtype
     return State(
         nav=nav,
         T_world_lidar=nav.T_world_imu @ nav.T_imu_lidar,
         mid_to_end=jnp.zeros((), dtype),
-        twist=jnp.zeros(6, dtype),
+        twist=jnp.zeros(6, dtype) if twist is None else twist,
         prediction_error=jnp.asarray(params.motion.initial_error, dtype),
         scans=jnp.int32(0),
         map=empty_map(config.map.capacity),
     )
+
+
+def restart(config: Config, params: Params, state: State) -> State:
+    """Return the state before the first scan once more, now with the velocity that ``state`` found.
+
+    A vehicle that is already moving distorts its first scan, which nothing can compensate until the second.
+    """
+    return init(config, params, state.twist)
 
 
 def step(
@@ -75,8 +89,8 @@ def step(
 ) -> tuple[State, Output]:
     """Register one scan and add it to the map.
 
-    Velocity is taken as constant from the middle of the last scan to the middle of this one, and is solved for
-    together with the pose: each trial pose deskews the scan with the velocity it implies.
+    Velocity is taken as constant from the middle of the last scan to the middle of this one, and is solved
+    for together with the pose: each trial pose deskews the scan with the velocity it implies.
 
     Args:
         config: static.
@@ -99,7 +113,7 @@ def step(
         def twist_to(T_world_lidar: jaxlie.SE3) -> Array:
             moved = (T_last_inverse @ T_world_lidar).log()
             known = (state.scans > 0) & (elapsed > 0)
-            return jnp.where(known, moved / jnp.where(known, elapsed, 1.0), 0.0)
+            return jnp.where(known, moved / jnp.where(known, elapsed, 1.0), state.twist)
 
     with jax.named_scope("register"):
         result = register(

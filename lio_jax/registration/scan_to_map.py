@@ -1,4 +1,4 @@
-"""Register a scan against the voxel map: point-to-distribution, robust Gauss-Newton, degeneracy aware."""
+"""Register a scan against the voxel map: point-to-plane, robust Gauss-Newton, degeneracy aware."""
 
 from collections.abc import Callable
 
@@ -6,23 +6,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
-from lio_jax.core.geometry import inverse3, largest_eigenvalue3, symmetric3
+from lio_jax.core.geometry import eigenvalues_and_normal3
 from lio_jax.core.params import Params
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, query_nearest
 
 CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES = 0, 1, 2
 """Status codes of a solve."""
-
-
-_JACOBIAN = np.zeros((3, 6, 4))
-for _axis in range(3):
-    _next, _last = (_axis + 1) % 3, (_axis + 2) % 3
-    _JACOBIAN[_axis, _next, 1 + _last], _JACOBIAN[_axis, _last, 1 + _next] = 1.0, -1.0
-    _JACOBIAN[_axis, 3 + _axis, 0] = 1.0
-"""d error_m / d step_c = sum_i _JACOBIAN[m, c, i] (1, arm)_i, for error = turn x arm + move."""
 
 
 class Registration(eqx.Module):
@@ -53,7 +44,7 @@ class NormalEquations(eqx.Module):
     squared_error: Float[Array, ""]
     """Robustly weighted sum of squared distances, m^2."""
     arm_squared: Float[Array, ""]
-    """Mean squared distance of the points from the sensor, m^2: makes rotations and translations comparable."""
+    """Mean squared distance of the points from the sensor, m^2: scales rotations to metres."""
 
 
 def linearise(
@@ -66,53 +57,48 @@ def linearise(
 ) -> NormalEquations:
     """Associate the points with the map at a pose and return the weighted normal equations there.
 
-    With the voxel's covariance C, its largest eigenvalue l and the range noise s, a point's offset e from the
-    mean costs e' W e with W = (s^2 I + C)^-1 - (s^2 + l)^-1 I: the excess over the least known direction. A flat
-    voxel acts as a plane, a thin one as a line, a shapeless one not at all, with no class boundaries between
-    (Biber & Strasser, "The normal distributions transform", IROS 2003, less its pull towards the mean).
-    Robust weight: Geman-McClure on s sqrt(e' W e), the noise-scaled distance in m.
+    A point at offset e from the mean of its voxel is measured along the voxel's normal n, with the precision
+    k = 1 / (s^2 + l0) - 1 / (s^2 + l1), where l0 <= l1 are the two smaller variances of the voxel and s is
+    the range noise: what is known about the normal in excess of the next direction. A flat voxel acts as a
+    plane; a shapeless one does not act at all, and neither does a single scan line, whose normal is
+    undefined, with no class boundaries between. Robust weight: Geman-McClure on s sqrt(k) n'e, the
+    noise-scaled distance in m.
     """
     dtype = T_world_lidar.wxyz_xyz.dtype
     voxel_size = params.map.voxel_size.astype(jnp.float32)
-    variance = params.lidar.range_sigma.astype(jnp.float32) ** 2
+    noise = params.lidar.range_sigma.astype(jnp.float32) ** 2
     anchor, corner = anchor_of(T_world_lidar.translation(), params.map.voxel_size)
     rotation = T_world_lidar.rotation().as_matrix().astype(jnp.float32)
     arm = points @ rotation.T
     anchored = arm + (T_world_lidar.translation() - corner).astype(jnp.float32)
     near = query_nearest(vmap, anchored, anchor, voxel_size, params.map.min_points.astype(jnp.float32))
 
-    diagonal = near.diagonal + variance
-    precision, off_precision = inverse3(diagonal, near.off_diagonal)
-    least_known = 1 / largest_eigenvalue3(diagonal, near.off_diagonal)
-    precision = symmetric3(precision - least_known[:, None], off_precision)
-
-    error = anchored - near.mean
-    weighted_error = jnp.sum(precision * error[:, None, :], -1)
-    distance_squared = variance * jnp.maximum(jnp.sum(error * weighted_error, -1), 0.0)
+    variances, normal = eigenvalues_and_normal3(near.diagonal, near.off_diagonal)
+    known = 1 / (noise + jnp.maximum(variances, 0.0))
+    precision = jnp.maximum(known[:, 0] - known[:, 1], 0.0)
+    distance = jnp.sum(normal * (anchored - near.mean), -1)
+    distance_squared = noise * precision * distance**2
     kernel_squared = kernel.astype(jnp.float32) ** 2
     used = mask & near.valid
     weight = jnp.where(used, (kernel_squared / (kernel_squared + distance_squared)) ** 2, 0.0)
 
-    # With h = (1, arm) the 3x6 Jacobian of a point is linear in h, so the normal equations are sums over the
-    # points of h_i h_j W_mn and h_i (W e)_m: one matrix product gives these and every other sum.
-    h = jnp.concatenate([jnp.ones_like(arm[:, :1]), arm], -1)
-    pairs = (h[:, :, None] * h[:, None, :]).reshape(-1, 16)
-    columns = [
-        (weight[:, None, None] * precision).reshape(-1, 9),
-        weight[:, None] * weighted_error,
-        jnp.stack([used.astype(jnp.float32), weight, weight * distance_squared], -1),
-    ]
-    sums = (pairs.T @ jnp.concatenate(columns, -1)).astype(dtype).reshape(4, 4, 15)
-    jacobian = jnp.asarray(_JACOBIAN, dtype)
-    hessian = jnp.einsum("mci,ndj,ijmn->cd", jacobian, jacobian, sums[:, :, :9].reshape(4, 4, 3, 3))
-    matches, weight_sum, squared_error = sums[0, 0, 12:]
+    # one matrix product gives every sum over the points: the normal equations from the rows, the rest from
+    # the column of ones
+    row = jnp.concatenate(
+        [jnp.cross(arm, normal), normal, distance[:, None], jnp.ones_like(distance)[:, None]], -1
+    )
+    matched = used.astype(jnp.float32)
+    scalars = [matched, weight, weight * distance_squared, matched * jnp.sum(arm**2, -1)]
+    weighted = jnp.concatenate([(weight * precision)[:, None] * row, jnp.stack(scalars, -1)], -1)
+    sums = (row.T @ weighted).astype(dtype)
+    matches, weight_sum, squared_error, arm_squared = sums[7, 8:]
     return NormalEquations(
-        hessian=(hessian + hessian.T) / 2,
-        gradient=jnp.einsum("mci,im->c", jacobian, sums[0, :, 9:12]),
+        hessian=(sums[:6, :6] + sums[:6, :6].T) / 2,
+        gradient=sums[:6, 6],
         matches=matches.astype(jnp.int32),
         weight=weight_sum,
         squared_error=squared_error,
-        arm_squared=jnp.trace(sums[1:, 1:, 12]) / jnp.maximum(matches, 1.0),
+        arm_squared=arm_squared / jnp.maximum(matches, 1.0),
     )
 
 
@@ -129,8 +115,8 @@ def register(
 
     The kernel starts as wide as the prediction may be wrong and halves with each iteration down to its own
     scale, so that a scan without a velocity prior still finds the map (graduated non-convexity, Blake &
-    Zisserman 1987). Directions the scan does not constrain keep the prediction (Zhang & Singh, "On degeneracy of
-    optimization-based state estimation problems", ICRA 2016).
+    Zisserman 1987). Directions the scan does not constrain keep the prediction (Zhang & Singh, "On
+    degeneracy of optimization-based state estimation problems", ICRA 2016).
 
     Args:
         vmap: the map.

@@ -51,12 +51,17 @@ class CompiledStep:
         self.params: Params = settings.params()
         self.compile_s = 0.0
         self._init = jax.jit(partial(recipe.init, self.config))
+        self._restart = jax.jit(partial(recipe.restart, self.config))
         self._step = jax.jit(partial(recipe.step, self.config), donate_argnums=1)
         self._programs: dict[int, Any] = {}
 
     def initial_state(self) -> Any:
         """Return the recipe's state before the first scan."""
         return self._init(self.params)
+
+    def restarted(self, state: Any) -> Any:
+        """Return the state before the first scan, with the velocity that ``state`` found."""
+        return self._restart(self.params, state)
 
     def __call__(self, state: Any, scan: Any) -> tuple[Any, Any]:
         """Run one step; ``state`` is consumed."""
@@ -81,6 +86,7 @@ def track(
     step = step or CompiledStep(settings)
     state = step.initial_state()
     last_end_ns, last_count, size = None, 0, 0
+    opening: list[Any] = []
     for index, scan in enumerate(scans):
         start = time.perf_counter()
         count = len(scan.points)
@@ -90,6 +96,10 @@ def track(
         arrays = padded(scan, last_end_ns, settings.config.lidar, size)
         padded_at = time.perf_counter()
         compiled_s = step.compile_s
+        if len(opening) == 1 and count:
+            state = _reopened(step, state, opening[0], arrays)
+        if len(opening) < 2 and count:
+            opening.append(arrays)
         state, output = step(state, arrays)
         nav, result = jax.tree.map(np.array, (state.nav, output.registration))
         lost = bool(output.lost)
@@ -107,6 +117,18 @@ def track(
             stage_ms={"pad": pad_ms, "step": step_ms, "total": pad_ms + step_ms},
             failure=_failure(count, result, lost, settings),
         )
+
+
+def _reopened(step: CompiledStep, state: Any, first: Any, second: Any) -> Any:
+    """Return the state after the first scan, compensated with the velocity that the second one shows.
+
+    Only the second scan tells how fast a vehicle is moving from the start; until then the map holds the first
+    scan distorted.
+    """
+    if first.duration == 0 or first.points.shape != second.points.shape:
+        return state
+    trial, _ = step(state, second)
+    return step(step.restarted(trial), first)[0]
 
 
 _STRAGGLER = 0.25

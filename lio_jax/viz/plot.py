@@ -89,10 +89,10 @@ def plot_timings(path_png: Path, stage_ms: Mapping[str, ArrayLike]) -> None:
     colours = [f"C{index % 10}" for index in range(len(values))]
     for (name, times), colour in zip(values.items(), colours, strict=True):
         _line(over_scans, np.arange(float(len(times))), times, colour, name, width=0.9)
-    limit = 1.3 * max(float(np.nanpercentile(times[np.isfinite(times)], 99.0)) for times in values.values())
+    limit = 1.5 * max(float(np.nanpercentile(times[np.isfinite(times)], 95.0)) for times in values.values())
     beyond = sum(int(np.sum(times > limit)) for times in values.values())
     over_scans.set_ylim(0.0, limit if limit > 0.0 else 1.0)
-    subtitle = f"{beyond} slower values lie above the frame" if beyond else "time of each scan"
+    subtitle = f"time of each scan ({beyond} off the scale)" if beyond else "time of each scan"
     _label(over_scans, "scan", "time [ms]", subtitle)
     rows = np.arange(len(values))[::-1]
     labels = []

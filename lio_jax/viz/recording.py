@@ -95,7 +95,10 @@ class Recording:
         if not np.isfinite(T_world_lidar).all():
             return
         quaternion = Rotation.from_matrix(T_world_lidar[:3, :3]).as_quat()
-        stream.log("world/lidar", rr.Transform3D(translation=T_world_lidar[:3, 3], quaternion=quaternion))
+        stream.log(
+            "world/lidar",
+            rr.Transform3D(translation=T_world_lidar[:3, 3], quaternion=rr.Quaternion(xyzw=quaternion)),
+        )
         thinned = _thinned(points, self._scan_points)
         heights = thinned @ T_world_lidar[2, :3].astype(np.float32)
         stream.log("world/lidar/scan", rr.Points3D(thinned, colors=colour_by_height(heights, -2.0, 8.0)))

@@ -55,14 +55,13 @@ def held_points() -> list[np.ndarray]:
 
 
 def weight_matrices() -> tuple[np.ndarray, np.ndarray]:
-    """Return each patch's mean and W = (s^2 I + C)^-1 - (s^2 + l)^-1 I."""
+    """Return each patch's mean and W = k n n' with k = 1 / (s^2 + l0) - 1 / (s^2 + l1)."""
     means, weights = [], []
     for points in held_points():
-        covariance = np.cov(points.T, bias=True)
-        largest = np.linalg.eigvalsh(covariance)[-1]
-        precision = np.linalg.inv(SIGMA**2 * np.eye(3) + covariance)
+        variances, axes = np.linalg.eigh(np.cov(points.T, bias=True))
+        precision = 1 / (SIGMA**2 + variances[0]) - 1 / (SIGMA**2 + variances[1])
         means.append(points.mean(0))
-        weights.append(precision - np.eye(3) / (SIGMA**2 + largest))
+        weights.append(precision * np.outer(axes[:, 0], axes[:, 0]))
     return np.array(means), np.array(weights)
 
 

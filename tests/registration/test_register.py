@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from lio_jax.mapping.voxel_map import empty_map
 from lio_jax.registration.scan_to_map import (
@@ -17,7 +16,6 @@ from lio_jax.registration.scan_to_map import (
     register,
 )
 from tests.registration.scenes import (
-    GROUND,
     POLES_AND_WALLS,
     ROOM,
     box_room,
@@ -79,7 +77,7 @@ def test_a_noise_free_scan_is_placed_to_millimetres():
     result = solve(MAPS["room"], scan_of("room", 5, noise=0.0), perturbed(0.2, 1.0, 0), 0.3)
     moved, turned = pose_error(result.T_world_lidar, TRUTH)
     assert moved < 0.008
-    assert turned < 0.06
+    assert turned < 0.1
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -152,7 +150,7 @@ def test_rmse_is_the_scatter_of_the_scan_about_the_map():
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_information_is_calibrated_in_order_of_magnitude(scene):
-    """The scatter of 48 noisy scans of one place against the inverse information, at the default range noise."""
+    """The scatter of 48 noisy scans of one place against the inverse information."""
     params = params_with()
     results = [solve(MAPS[scene], scan_of(scene, 2000 + k), TRUTH, 0.05, params) for k in range(48)]
     assert all(result.status == CONVERGED for result in results)
@@ -219,49 +217,6 @@ def test_iterations_stop_when_the_steps_are_small():
     result = solve(MAPS["room"], scan_of("room", 1), TRUTH, 0.05)
     assert result.status == CONVERGED
     assert 1 < result.iterations < 15
-
-
-CORRIDOR = box_room(200.0, 9.0, 4.5)
-"""Its ends are out of sight: nothing tells the position along its axis, which lies at 0.2 rad."""
-DECIDED = params_with(lidar__range_sigma=0.03, registration__degeneracy_ratio=0.06)
-"""A threshold that lies well between the corridor's axis (0.02 to 0.03) and its next weakest direction (0.1)."""
-
-
-@pytest.mark.parametrize("along", [-0.4, 0.0, 0.4])
-@pytest.mark.parametrize("params", [PARAMS, DECIDED], ids=["default threshold", "decided threshold"])
-def test_a_corridor_keeps_the_prediction_along_its_axis(params, along):
-    vmap = map_of(sample(CORRIDOR, 60000, NOISE, seed=0, reach=20.0), params)
-    truth = pose([0, 0, 0], [0, 0, 0.2])
-    start = truth @ pose([along, 0.1, 0.08], [0.01, 0.01, -0.02])
-    points = seen_from(truth, sample(CORRIDOR, POINTS, NOISE, seed=1, reach=12.0))
-    result = solve(vmap, points, start, 0.5, params)
-    # seen in the corridor's own axes, because the true pose is aligned with them
-    off = matrix(truth.inverse() @ result.T_world_lidar)
-    assert result.status == CONVERGED
-    assert np.linalg.norm(off[1:3, 3]) < 0.02
-    assert pose_error(result.T_world_lidar, truth)[1] < 0.2
-    assert np.asarray(result.degenerate).tolist() == [True] + [False] * 5
-    assert abs(off[0, 3] - along) < 0.05
-
-
-@pytest.mark.parametrize(
-    "params",
-    [PARAMS, params_with(lidar__range_sigma=0.03, registration__degeneracy_ratio=0.1)],
-    ids=["default threshold", "decided threshold"],
-)
-def test_bare_ground_leaves_three_directions_to_the_prediction(params):
-    vmap = map_of(sample(GROUND, 60000, NOISE, seed=0), params)
-    start = pose([0.3, -0.2, 0.1], [0.02, -0.01, 0.03])
-    points = seen_from(pose([0, 0, 0], [0, 0, 0]), sample(GROUND, POINTS, NOISE, seed=1, reach=25.0))
-    result = solve(vmap, points, start, 0.5, params)
-    found = matrix(result.T_world_lidar)
-    # the ground is at z = -1.7 of the true pose: height, roll and pitch are known
-    np.testing.assert_allclose(found[2, 3], 0.0, atol=0.01)
-    np.testing.assert_allclose(found[2, :2], 0.0, atol=2e-3)
-    assert np.asarray(result.degenerate).tolist() == [True] * 3 + [False] * 3
-    np.testing.assert_allclose(found[:2, 3], [0.3, -0.2], atol=0.05)
-    yaw = Rotation.from_matrix(found[:3, :3]).as_euler("zyx")[0]
-    np.testing.assert_allclose(yaw, 0.03, atol=0.005)
 
 
 def test_repeats_bit_for_bit():

@@ -1,0 +1,184 @@
+"""A sensor that moves with constant velocity through a hall: every pose is known in closed form."""
+
+from dataclasses import dataclass
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from scipy.linalg import expm
+
+from lio_jax.core.config import Config, LidarConfig, MapConfig
+from lio_jax.core.params import DEFAULTS, Params, params_from_values
+from lio_jax.core.types import Scan
+from lio_jax.recipes import default
+from lio_jax.recipes.default import Output, State
+from lio_jax.sim.lidar import column_times, spinning_lidar, sweep
+from lio_jax.sim.worlds import Boxes, Cylinders, Planes, World
+
+PERIOD, BEAMS, COLUMNS = 0.1, 16, 256
+CONFIG = Config(
+    lidar=LidarConfig(buckets=(BEAMS * COLUMNS,), registration_points=2048, insertion_points=4096),
+    map=MapConfig(capacity=16384),
+)
+LIDAR = spinning_lidar(BEAMS, COLUMNS, elevation_deg=(-20.0, 15.0), range_sigma=0.01)
+TWIST = np.array([6.0, 0.3, 0.1, 0.02, -0.03, 0.3])
+"""Of the lidar in its own frame: m/s, then rad/s."""
+
+
+def hall() -> World:
+    """Return a hall of 34 x 22 x 7 m with crates and columns, the sensor's start at the origin."""
+    sides = zip(np.eye(3), (17, 11, 3.5), strict=True)
+    walls = [(sign * size * axis, -sign * axis) for axis, size in sides for sign in (-1, 1)]
+    points, normals = (np.array(part) + 0.0 for part in zip(*walls, strict=True))
+    crates = np.array(
+        [
+            [7.3, 4.1, -2.5, 1.2, 0.8, 1.0, 0.3],
+            [-6.2, -5.3, -2.0, 0.9, 1.6, 1.5, 1.1],
+            [11.0, -6.4, -2.2, 1.5, 1.1, 1.3, -0.6],
+            [-10.5, 6.2, -1.5, 1.0, 1.0, 2.0, 0.8],
+            [2.5, -8.0, -2.6, 2.0, 0.7, 0.9, 0.1],
+        ]
+    )
+    columns = np.array([[5.0, -4.0], [-5.0, 5.0], [12.0, 3.0], [-12.0, -2.0]])
+
+    def array(values) -> jax.Array:
+        return jnp.asarray(values, jnp.float32)
+
+    return World(
+        Planes(array(points), array(normals), array(np.full(6, 0.5))),
+        Boxes(array(crates[:, :3]), array(crates[:, 3:6]), array(crates[:, 6]), array(np.full(5, 0.5))),
+        Cylinders(
+            array(np.column_stack([columns, np.full(4, -3.5)])),
+            array(np.full(4, 0.3)),
+            array(np.full(4, 7.0)),
+            array(np.full(4, 0.5)),
+        ),
+    )
+
+
+WORLD = hall()
+
+
+def moved(twist: np.ndarray, seconds: float) -> np.ndarray:
+    """Return the (4, 4) motion of a constant twist, by scipy's matrix exponential."""
+    (vx, vy, vz), (wx, wy, wz) = twist[:3], twist[3:]
+    return expm(seconds * np.array([[0, -wz, wy, vx], [wz, 0, -wx, vy], [-wy, wx, 0, vz], [0, 0, 0, 0]]))
+
+
+def lidar_pose(seconds: float, twist: np.ndarray = TWIST) -> np.ndarray:
+    """Return the lidar's (4, 4) pose in the hall ``seconds`` after the first scan began."""
+    return moved(np.asarray(twist), seconds)
+
+
+@jax.jit
+def _turn(poses: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    turn = sweep(LIDAR, WORLD, jaxlie.SE3.from_matrix(poses), key)
+    return turn.points.reshape(-1, 3), turn.mask.reshape(-1)
+
+
+@cache
+def _measured(number: int, twist: tuple[float, ...], still: bool) -> tuple[np.ndarray, np.ndarray]:
+    times = number * PERIOD + np.asarray(column_times(LIDAR), float)
+    if still:
+        times = np.full_like(times, (number + 1) * PERIOD)
+    poses = np.stack([lidar_pose(t, np.array(twist)) for t in times])
+    points, mask = _turn(jnp.asarray(poses, jnp.float32), jax.random.key(number))
+    return np.asarray(points), np.asarray(mask)
+
+
+def scan(number: int, interval: float | None = None, twist: np.ndarray = TWIST, still: bool = False) -> Scan:
+    """Return turn ``number``, which lasts from number * PERIOD on.
+
+    Args:
+        number: of the turn.
+        interval: since the last scan's end, s; None: 0 for the first, one period for the others.
+        twist: of the lidar.
+        still: a compensated sweep: as if all points had been measured at the turn's end.
+    """
+    points, mask = _measured(number, tuple(np.asarray(twist).tolist()), still)
+    times = np.repeat(np.asarray(column_times(LIDAR), np.float32), BEAMS)
+    if interval is None:
+        interval = PERIOD if number else 0.0
+    return Scan(
+        points=jnp.asarray(points),
+        time=jnp.asarray(0 * times if still else times),
+        ring=jnp.asarray(np.tile(np.arange(BEAMS, dtype=np.int32), COLUMNS)),
+        intensity=jnp.zeros(len(points), jnp.float32),
+        mask=jnp.asarray(mask),
+        duration=jnp.float32(0.0 if still else PERIOD),
+        interval=jnp.float32(interval),
+    )
+
+
+def params_with(**paths: float | list[float]) -> Params:
+    """Return default parameters fit for the hall, with changes such as ``map__reach=50.0``."""
+    values = {section: dict(leaves) for section, leaves in DEFAULTS.items()}
+    for path, value in {"lidar__min_range": 0.5, **paths}.items():
+        section, name = path.split("__")
+        assert name in values[section]
+        values[section][name] = value
+    return params_from_values(values)
+
+
+PARAMS = params_with()
+STEP = jax.jit(partial(default.step, CONFIG))
+"""Compiled once for all tests: parameters and scans are traced."""
+
+
+def initial(params: Params = PARAMS) -> State:
+    return default.init(CONFIG, params)
+
+
+@dataclass
+class Step:
+    """What one step returned."""
+
+    state: State
+    output: Output
+
+    @property
+    def T_world_imu(self) -> np.ndarray:
+        """(4, 4)."""
+        return np.asarray(self.state.nav.T_world_imu.as_matrix())
+
+
+def run(scans: list[Scan], params: Params = PARAMS) -> list[Step]:
+    """Feed scans one after another."""
+    state, steps = initial(params), []
+    for item in scans:
+        state, output = STEP(params, state, item)
+        steps.append(Step(state, output))
+    return steps
+
+
+def distance_to_hall(points: np.ndarray) -> np.ndarray:
+    """Return the distance (m) of points (n, 3) in the hall's frame to its nearest surface."""
+    walls = np.abs(np.abs(points) - [17, 11, 3.5]).min(1)
+    found = [walls]
+    for x, y in np.asarray(WORLD.cylinders.base)[:, :2]:
+        found.append(np.abs(np.hypot(points[:, 0] - x, points[:, 1] - y) - 0.3))
+    boxes = WORLD.boxes
+    for centre, half, yaw in zip(*map(np.asarray, (boxes.center, boxes.half_size, boxes.yaw)), strict=True):
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        local = (points - centre) @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+        outside = np.abs(local) - half
+        found.append(np.linalg.norm(np.maximum(outside, 0), axis=1) + np.abs(np.minimum(outside.max(1), 0)))
+    return np.min(found, 0)
+
+
+def apart(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
+    """Return distance (m) and angle (deg) between two poses."""
+    difference = np.linalg.inv(expected) @ found
+    angle = np.arccos(np.clip((np.trace(difference[:3, :3]) - 1) / 2, -1, 1))
+    return float(np.linalg.norm(difference[:3, 3])), float(np.rad2deg(angle))
+
+
+def expected_pose(seconds: float, twist: np.ndarray = TWIST) -> np.ndarray:
+    """Return T_world_lidar in the estimator's world.
+
+    Its origin is where the lidar was in the middle of the first scan, because that is the instant a scan is
+    registered for and the velocity is not known yet.
+    """
+    return np.linalg.inv(lidar_pose(PERIOD / 2, twist)) @ lidar_pose(seconds, twist)

@@ -1,0 +1,116 @@
+"""Parameters are traced: changing one recompiles nothing, a batch of them is a vmap, the state is donated."""
+
+import warnings
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lio_jax.core.params import DEFAULTS, default_params
+from lio_jax.core.types import state_dtype
+from lio_jax.recipes import default
+from tests.recipes.drive import (
+    CONFIG,
+    PARAMS,
+    STEP,
+    Step,
+    apart,
+    expected_pose,
+    initial,
+    params_with,
+    run,
+    scan,
+)
+
+PATHS = [f"{section}__{name}" for section, leaves in DEFAULTS.items() for name in leaves]
+
+SETS = [
+    {},
+    {"registration__kernel": 0.4},
+    {"lidar__range_sigma": 0.02},
+    {"map__voxel_size": 1.0},
+    {"registration__point_spacing": 0.5},
+    {"map__point_spacing": 0.4, "map__min_points": 4.0},
+    {"motion__initial_error": 1.0, "motion__error_decay": 0.3},
+    {"lidar__max_range": 15.0, "extrinsics__translation": [0.3, -0.2, 0.1]},
+]
+
+
+def test_every_leaf_has_a_path():
+    assert len(PATHS) == len(jax.tree.leaves(default_params()))
+
+
+def test_changing_any_parameter_recompiles_nothing():
+    state, _ = STEP(PARAMS, initial(), scan(0))
+    for path in PATHS:
+        section, name = path.split("__")
+        leaf = getattr(getattr(PARAMS, section), name)
+        changed = eqx.tree_at(
+            lambda params, s=section, n=name: getattr(getattr(params, s), n), PARAMS, leaf * 0.9
+        )
+        STEP(changed, state, scan(1))
+    assert STEP._cache_size() == 1
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_parameters_come_as_arrays_of_the_states_precision(path):
+    """A Python number among the leaves would be another program."""
+    section, name = path.split("__")
+    leaf = getattr(getattr(PARAMS, section), name)
+    assert leaf.dtype == state_dtype()
+    assert not leaf.weak_type
+
+
+def test_a_batch_of_parameters_equals_one_run_after_another():
+    """To rounding: a batched product adds float32 numbers up in another order."""
+    scans = [scan(number) for number in range(5)]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(params_with(**changes) for changes in SETS))
+    step = jax.jit(jax.vmap(partial(default.step, CONFIG), in_axes=(0, 0, None)))
+    states = jax.vmap(partial(default.init, CONFIG))(batch)
+    poses = []
+    for item in scans:
+        states, outputs = step(batch, states, item)
+        poses.append(np.asarray(jax.vmap(lambda T: T.as_matrix())(states.nav.T_world_imu)))
+    distinct = set()
+    for row, changes in enumerate(SETS):
+        alone = run(scans, params_with(**changes))
+        for number, one in enumerate(alone):
+            np.testing.assert_allclose(poses[number][row], one.T_world_imu, atol=1e-5, err_msg=f"{changes}")
+        assert int(outputs.registration.matches[row]) == int(alone[-1].output.registration.matches)
+        assert int(outputs.added[row].sum()) == int(alone[-1].output.added.sum())
+        distinct.add(alone[-1].T_world_imu.tobytes())
+    assert len(distinct) == len(SETS)
+
+
+def test_the_state_is_donated():
+    step = jax.jit(partial(default.step, CONFIG), donate_argnums=1)
+    kept = run([scan(number) for number in range(3)])
+    state = jax.tree.map(jnp.array, initial())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for number in range(3):
+            before = state
+            state, output = step(PARAMS, before, scan(number))
+            assert before.map.moments.is_deleted()
+            assert not output.points.is_deleted()
+    for one, other in zip(jax.tree.leaves(state), jax.tree.leaves(kept[-1].state), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_single_precision_states_where_x64_is_off():
+    with jax.enable_x64(False):
+        params = params_with()
+        step = jax.jit(partial(default.step, CONFIG))
+        state = default.init(CONFIG, params)
+        for number in range(6):
+            state, output = step(params, state, scan(number))
+        assert {str(leaf.dtype) for leaf in jax.tree.leaves((state, output))} <= {
+            "float32",
+            "int32",
+            "uint32",
+            "bool",
+        }
+        assert apart(Step(state, output).T_world_imu, expected_pose(0.6))[0] < 0.06
