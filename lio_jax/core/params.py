@@ -101,7 +101,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "kernel": 0.2,
         "rotation_tolerance": 1e-4,
         "translation_tolerance": 1e-3,
-        "degeneracy_ratio": 1e-3,
+        "degeneracy_ratio": 0.01,
         "min_matches": 50.0,
     },
     "motion": {"initial_error": 2.0, "error_decay": 0.5},

@@ -101,7 +101,7 @@ def test_coincident_points_have_an_upright_normal(dtype):
     diagonal = jnp.full((4, 3), 0.25, dtype)
     values, normals = eigenvalues_and_normal3(diagonal, jnp.zeros_like(diagonal))
     np.testing.assert_allclose(values, 0.25, rtol=1e-6)
-    np.testing.assert_array_equal(normals, np.tile([0, 0, 1], (4, 1)))
+    np.testing.assert_allclose(normals, np.tile([0, 0, 1], (4, 1)), atol=1e-15)
 
 
 def test_any_batch_shape():

@@ -161,7 +161,7 @@ def test_override_that_is_not_yaml():
 
 def test_file_that_is_not_there_is_named(tmp_path):
     path = tmp_path / "absent.yaml"
-    with pytest.raises(UsageError, match="cannot be read as a settings file") as caught:
+    with pytest.raises(UsageError, match="the settings file cannot be read") as caught:
         load_settings(path)
     assert str(path) in str(caught.value)
 
@@ -169,5 +169,5 @@ def test_file_that_is_not_there_is_named(tmp_path):
 def test_file_that_is_not_text_is_named(tmp_path):
     path = tmp_path / "binary.yaml"
     path.write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(UsageError, match=r"binary\.yaml: cannot be read as a settings file"):
+    with pytest.raises(UsageError, match=r"binary\.yaml: is not a text file"):
         load_settings(path)
