@@ -50,6 +50,7 @@ class CompiledStep:
         self.config: Config = settings.config
         self.params: Params = settings.params()
         self.compile_s = 0.0
+        self._cold = True
         self._init = jax.jit(partial(recipe.init, self.config))
         self._restart = jax.jit(partial(recipe.restart, self.config))
         self._step = jax.jit(partial(recipe.step, self.config), donate_argnums=1)
@@ -57,7 +58,12 @@ class CompiledStep:
 
     def initial_state(self) -> Any:
         """Return the recipe's state before the first scan."""
-        return self._init(self.params)
+        start = time.perf_counter()
+        state = self._init(self.params)
+        self._restart = self._restart.lower(self.params, state).compile() if self._cold else self._restart
+        self.compile_s += (time.perf_counter() - start) * self._cold
+        self._cold = False
+        return state
 
     def restarted(self, state: Any) -> Any:
         """Return the state before the first scan, with the velocity that ``state`` found."""

@@ -1,6 +1,7 @@
 """Settings files and overrides: strict, and exact both ways."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
@@ -230,3 +231,8 @@ def test_extrinsics_from_a_matrix():
     settings = with_extrinsics(Settings(), T, SOURCE)
     np.testing.assert_allclose(settings.params().extrinsics.T_imu_lidar().as_matrix(), T, atol=1e-12)
     assert {path.rsplit(".", 1)[0] for path in settings.given} == {"params.extrinsics"}
+
+
+def test_the_shipped_default_file_is_the_default():
+    path = Path(__file__).resolve().parents[2] / "configs" / "recipes" / "default.yaml"
+    assert load_settings(path).as_dict() == Settings().as_dict()

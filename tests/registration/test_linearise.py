@@ -194,7 +194,7 @@ def test_sums_are_those_of_the_matched_points(kernel):
 
 
 def test_the_shape_of_a_voxel_decides_what_it_measures():
-    """A wall measures along its normal; a pole or a single scan line, whose normal is open, next to nothing."""
+    """A wall measures along its normal; a pole or a scan line, whose normal is open, next to nothing."""
     scale = SIGMA**2
     wall, floor, pole, edge, cloud = (np.linalg.eigvalsh(scale * w) for w in WEIGHTS[:5])
     for flat in (wall, floor):

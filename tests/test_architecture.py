@@ -1,0 +1,171 @@
+"""The house's rules: imports only go down, importing changes nothing and says nothing."""
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import lio_jax
+
+PACKAGE = Path(lio_jax.__file__).parent
+
+FLOORS = {
+    "core": 1,
+    "imu": 2,
+    "lidar": 2,
+    "mapping": 2,
+    "registration": 3,
+    "estimation": 3,
+    "loops": 3,
+    "recipes": 4,
+    "data": 4,
+    "sim": 4,
+    "run": 5,
+    "evaluation": 6,
+    "tuning": 6,
+    "ablation": 6,
+    "viz": 6,
+    "commands": 7,
+    "cli": 7,
+}
+
+NEIGHBOURS = {("sim", "data"), ("viz", "evaluation"), ("cli", "commands")}
+"""Imports within a floor, one way only: a simulated drive is a Sequence, a plot against truth is aligned as
+its score is, and a command line has commands."""
+
+HEAVY = {"rerun", "evo", "matplotlib", "rosbags", "pypcd4"}
+
+FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
+
+
+def package_of(module: str) -> str:
+    """Return the floor-bearing part of a name such as lio_jax.run.track."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else ""
+
+
+def module_name(path: Path) -> str:
+    parts = ["lio_jax", *path.relative_to(PACKAGE).with_suffix("").parts]
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imported(tree: ast.AST, module: str, is_package: bool) -> list[str]:
+    """Return the full names of all modules imported anywhere in a file."""
+    names: list[str] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                parts = module.split(".") if is_package else module.split(".")[:-1]
+                above = parts[: len(parts) - node.level + 1]
+                base = ".".join([*above, base] if base else above)
+            # "from lio_jax import run" imports a package too
+            names += [f"{base}.{alias.name}" for alias in node.names] if base == "lio_jax" else [base]
+    return names
+
+
+def violations(path: Path) -> list[str]:
+    """Return the imports of one file that do not go down."""
+    module = module_name(path)
+    own = package_of(module)
+    wrong = []
+    for name in imported(ast.parse(path.read_text()), module, path.name == "__init__.py"):
+        if name.split(".")[0] != "lio_jax":
+            continue
+        other = package_of(name)
+        if other == own or (own, other) in NEIGHBOURS:
+            continue
+        if other not in FLOORS or FLOORS[other] >= FLOORS[own]:
+            wrong.append(name)
+    return wrong
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: module_name(path))
+def test_imports_only_go_down(path):
+    assert violations(path) == []
+
+
+def test_every_package_has_a_floor():
+    packages = {path.name for path in PACKAGE.iterdir() if path.is_dir() and list(path.glob("*.py"))}
+    modules = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__"}
+    assert packages | modules <= set(FLOORS)
+
+
+def test_the_rule_can_see_an_upward_import(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "PACKAGE", tmp_path)
+    core = tmp_path / "core"
+    core.mkdir()
+    for text in (
+        "from lio_jax.run.run import run_sequence",
+        "import lio_jax.viz.plot",
+        "from lio_jax import recipes",
+        "from ..mapping import voxel_map",
+        "def late():\n    from lio_jax.sim.street import street",
+    ):
+        (core / "bad.py").write_text(text)
+        assert violations(core / "bad.py"), text
+    (core / "good.py").write_text(
+        "from lio_jax.core.types import Scan\nfrom .config import Config\nimport numpy"
+    )
+    assert violations(core / "good.py") == []
+
+
+def run_python(code: str) -> subprocess.CompletedProcess:
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
+    environment["JAX_PLATFORMS"] = "cpu"
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env=environment,
+        cwd=PACKAGE.parent,
+        timeout=120,
+        check=False,
+    )
+
+
+EVERY_MODULE = """
+import importlib, pkgutil, sys
+import jax
+before = dict(jax.config.values)
+import lio_jax
+names = [m.name for m in pkgutil.walk_packages(lio_jax.__path__, 'lio_jax.')]
+for name in names:
+    if not name.endswith('__main__'):
+        importlib.import_module(name)
+assert len(names) > 40, names
+after = dict(jax.config.values)
+changed = {key for key in after if after[key] != before.get(key)}
+assert not changed, changed
+assert jax.numpy.zeros(1).dtype == 'float32'
+"""
+
+
+def test_importing_every_module_changes_no_setting_of_jax_and_prints_nothing():
+    done = run_python(EVERY_MODULE)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""
+    assert done.stderr == ""
+
+
+def test_heavy_libraries_are_not_imported_with_the_package():
+    done = run_python(f"import sys, lio_jax, lio_jax.cli; print(sorted({HEAVY!r} & set(sys.modules)))")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[]"
+
+
+def test_no_module_prints_outside_the_command_line():
+    """Results go through return values and files; only commands speak to the terminal."""
+    speaking = []
+    for path in FILES:
+        if package_of(module_name(path)) in ("commands", "cli"):
+            continue
+        calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+        if any(isinstance(call.func, ast.Name) and call.func.id == "print" for call in calls):
+            speaking.append(module_name(path))
+    assert speaking == []
