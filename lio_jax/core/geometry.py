@@ -13,10 +13,10 @@ def eigenvalues_and_normal3(
     """Return ascending eigenvalues and the unit eigenvector of the smallest one, without LAPACK.
 
     The eigenvalue that stands apart from the other two comes from the trigonometric solution of the
-    characteristic cubic (Smith, "Eigenvalues of a symmetric 3 x 3 matrix", CACM 1961) and its eigenvector from
-    the longest cross product of two rows of A - lambda I; the other two come from the 2x2 problem in the plane
-    across it (Eberly, "A robust eigensolver for 3 x 3 symmetric matrices", 2014). Flat, thin and round voxels
-    are all solved to float32's precision. Where all three coincide the eigenvector is (0, 0, 1).
+    characteristic cubic (Smith, "Eigenvalues of a symmetric 3 x 3 matrix", CACM 1961) and its eigenvector
+    from the longest cross product of two rows of A - lambda I; the other two come from the 2x2 problem in
+    the plane across it (Eberly, "A robust eigensolver for 3 x 3 symmetric matrices", 2014). Flat, thin and
+    round voxels are all solved to float32's precision. Where all three coincide the eigenvector is (0, 0, 1).
     """
     tiny = jnp.finfo(diagonal.dtype).tiny
     mean = jnp.mean(diagonal, -1)

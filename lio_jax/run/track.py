@@ -50,33 +50,29 @@ class CompiledStep:
         self.config: Config = settings.config
         self.params: Params = settings.params()
         self.compile_s = 0.0
-        self._cold = True
         self._init = jax.jit(partial(recipe.init, self.config))
         self._restart = jax.jit(partial(recipe.restart, self.config))
         self._step = jax.jit(partial(recipe.step, self.config), donate_argnums=1)
-        self._programs: dict[int, Any] = {}
+        self._programs: dict[Any, Any] = {}
 
     def initial_state(self) -> Any:
         """Return the recipe's state before the first scan."""
-        start = time.perf_counter()
-        state = self._init(self.params)
-        self._restart = self._restart.lower(self.params, state).compile() if self._cold else self._restart
-        self.compile_s += (time.perf_counter() - start) * self._cold
-        self._cold = False
-        return state
+        return self._run("init", self._init, self.params)
 
     def restarted(self, state: Any) -> Any:
         """Return the state before the first scan, with the velocity that ``state`` found."""
-        return self._restart(self.params, state)
+        return self._run("restart", self._restart, self.params, state)
 
     def __call__(self, state: Any, scan: Any) -> tuple[Any, Any]:
         """Run one step; ``state`` is consumed."""
-        size = scan.points.shape[0]
-        if size not in self._programs:
+        return self._run(scan.points.shape[0], self._step, self.params, state, scan)
+
+    def _run(self, key: Any, function: Any, *arguments: Any) -> Any:
+        if key not in self._programs:
             start = time.perf_counter()
-            self._programs[size] = self._step.lower(self.params, state, scan).compile()
+            self._programs[key] = function.lower(*arguments).compile()
             self.compile_s += time.perf_counter() - start
-        return self._programs[size](self.params, state, scan)
+        return self._programs[key](*arguments)
 
 
 def track(
