@@ -106,13 +106,16 @@ def step(
         )
     with jax.named_scope("predict"):
         middle = 0.5 * scan.duration.astype(state.twist.dtype)
-        elapsed = state.mid_to_end + scan.interval.astype(state.twist.dtype) - middle
+        first = state.scans == 0
+        # the first scan's end is the world's origin, however many empty scans went before
+        interval = jnp.where(first, 0.0, scan.interval.astype(state.twist.dtype))
+        elapsed = state.mid_to_end + interval - middle
         prediction = state.T_world_lidar @ jaxlie.SE3.exp(elapsed * state.twist)
         T_last_inverse = state.T_world_lidar.inverse()
 
         def twist_to(T_world_lidar: jaxlie.SE3) -> Array:
             moved = (T_last_inverse @ T_world_lidar).log()
-            known = (state.scans > 0) & (elapsed > 0)
+            known = ~first & (elapsed > 0)
             return jnp.where(known, moved / jnp.where(known, elapsed, 1.0), state.twist)
 
     with jax.named_scope("register"):
@@ -125,7 +128,6 @@ def step(
             params,
             config.registration.max_iterations,
         )
-        first = state.scans == 0
         lost = (result.status == TOO_FEW_MATCHES) & ~first
         twist = jnp.where(lost, state.twist, twist_to(result.T_world_lidar))
         missed = jnp.linalg.norm((prediction.inverse() @ result.T_world_lidar).translation())
