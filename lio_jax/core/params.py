@@ -95,10 +95,10 @@ class Params(eqx.Module):
 
 DEFAULTS: dict[str, dict[str, Any]] = {
     "lidar": {"range_sigma": 0.045, "min_range": 2.0, "max_range": 100.0},
-    "map": {"voxel_size": 1.2, "point_spacing": 0.3, "min_points": 3.0, "reach": 120.0},
+    "map": {"voxel_size": 1.2, "point_spacing": 0.25, "min_points": 3.0, "reach": 120.0},
     "registration": {
-        "point_spacing": 0.7,
-        "kernel": 0.2,
+        "point_spacing": 0.5,
+        "kernel": 0.15,
         "rotation_tolerance": 1e-4,
         "translation_tolerance": 1e-3,
         "degeneracy_ratio": 0.01,

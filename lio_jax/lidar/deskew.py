@@ -19,12 +19,12 @@ def deskew_constant_velocity(
     """
     velocity, rate = twist[:3].astype(jnp.float32), twist[3:].astype(jnp.float32)
     angle_squared = delay**2 * jnp.sum(rate**2)
-    small = angle_squared < 1e-6
+    small = angle_squared < 1e-2  # above it 1 - cos keeps enough digits in float32
     safe = jnp.where(small, 1.0, angle_squared)
     angle = jnp.sqrt(safe)
-    a = jnp.where(small, 1 - angle_squared / 6, jnp.sin(angle) / angle)
-    b = jnp.where(small, 0.5 - angle_squared / 24, (1 - jnp.cos(angle)) / safe)
-    c = jnp.where(small, 1 / 6 - angle_squared / 120, (1 - a) / safe)
+    a = jnp.where(small, 1 - angle_squared / 6 * (1 - angle_squared / 20), jnp.sin(angle) / angle)
+    b = jnp.where(small, 0.5 - angle_squared / 24 * (1 - angle_squared / 30), (1 - jnp.cos(angle)) / safe)
+    c = jnp.where(small, 1 / 6 - angle_squared / 120 * (1 - angle_squared / 42), (1 - a) / safe)
     omega = delay[:, None] * rate
     shift = delay[:, None] * velocity
     crossed = jnp.cross(omega, points)
