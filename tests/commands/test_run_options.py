@@ -219,7 +219,7 @@ def test_wrong_settings_file(folder, cli, tmp_path, text, message):
 def test_settings_file_that_is_not_there(folder, cli, tmp_path):
     done = cli("run", folder, "--out", tmp_path / "out", "--recipe", tmp_path / "mine.yaml")
     assert done.status == 2
-    assert "mine.yaml: cannot be read as a settings file" in done.err
+    assert "mine.yaml: the settings file cannot be read" in done.err
 
 
 def test_unknown_recipe(folder, cli, tmp_path):

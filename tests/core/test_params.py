@@ -38,9 +38,9 @@ def test_each_value_reaches_the_leaf_of_its_name(path):
     section, name = path.split(".")
     values = copy.deepcopy(DEFAULTS)
     wanted = (
-        [0.25 + i for i in range(len(values[section][name]))]
+        [0.375 + i for i in range(len(values[section][name]))]
         if isinstance(values[section][name], list)
-        else 0.25
+        else 0.375
     )
     values[section][name] = wanted
     params = params_from_values(values)

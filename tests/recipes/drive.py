@@ -112,10 +112,19 @@ def scan(number: int, interval: float | None = None, twist: np.ndarray = TWIST, 
     )
 
 
+HALL = {
+    "lidar__min_range": 0.5,
+    "map__point_spacing": 0.3,
+    "registration__point_spacing": 0.7,
+    "registration__kernel": 0.2,
+}
+"""What differs from the defaults: the hall is small, and so are the capacities."""
+
+
 def params_with(**paths: float | list[float]) -> Params:
     """Return default parameters fit for the hall, with changes such as ``map__reach=50.0``."""
     values = {section: dict(leaves) for section, leaves in DEFAULTS.items()}
-    for path, value in {"lidar__min_range": 0.5, **paths}.items():
+    for path, value in {**HALL, **paths}.items():
         section, name = path.split("__")
         assert name in values[section]
         values[section][name] = value
