@@ -15,7 +15,7 @@ jax.config.update("jax_enable_x64", True)
 # lio_jax.core.types, because the runner fills a Scan with numpy arrays, and the host-side packages, because
 # their protocols are not runtime_checkable.
 _CHECKED = (
-    "core.config core.files core.fusion core.geometry core.hashing core.params core.settings "
+    "core.config core.files core.geometry core.hashing core.params core.settings "
     "imu lidar mapping registration estimation loops recipes sim"
 )
 install_import_hook([f"lio_jax.{name}" for name in _CHECKED.split()], f"{type_checker.__name__}.checked")

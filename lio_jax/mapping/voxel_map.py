@@ -9,7 +9,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Float32, Int32, UInt32
 
-from lio_jax.core.fusion import materialised
 from lio_jax.core.hashing import voxel_hash
 
 WAYS = 2
@@ -96,8 +95,8 @@ def query_nearest(
     count, sums = _count_and_sums(vmap.moments, jnp.maximum(slot, 0))
     usable = (slot >= 0) & (count >= min_points)
     away = points[:, None] - centre - sums / jnp.maximum(count, 1.0)[..., None]
-    distance = materialised(jnp.where(usable, jnp.sum(away**2, -1), jnp.inf))
-    row, best = jnp.arange(points.shape[0]), materialised(_smallest_column(distance))
+    distance = jnp.where(usable, jnp.sum(away**2, -1), jnp.inf)
+    row, best = jnp.arange(points.shape[0]), _smallest_column(distance)
     moments = _take(vmap.moments, jnp.maximum(_take(slot, (row, best)), 0))
     mean, diagonal, off_diagonal = _mean_and_covariance(moments)
     return Distributions(
@@ -164,7 +163,7 @@ def find_slots(vmap: VoxelMap, voxel: Int32[Array, "*b 3"]) -> Int32[Array, "*b"
     for way in range(WAYS):
         candidate = first + way
         slot = jnp.where(jnp.all(_take(vmap.voxel, candidate) == voxel, -1), candidate, slot)
-    return materialised(slot)
+    return slot
 
 
 def _claim_slots(
@@ -214,7 +213,7 @@ def _mean_and_covariance(moments: Float32[Array, "*b 10"]) -> tuple[Array, Array
 
 def _first_slot(vmap: VoxelMap, voxel: Int32[Array, "*b 3"]) -> Int32[Array, "*b"]:
     buckets = vmap.voxel.shape[0] // WAYS
-    return materialised(((voxel_hash(voxel) & jnp.uint32(buckets - 1)) * WAYS).astype(jnp.int32))
+    return ((voxel_hash(voxel) & jnp.uint32(buckets - 1)) * WAYS).astype(jnp.int32)
 
 
 def _count_and_sums(
