@@ -52,6 +52,14 @@ class LidarConfig:
 
 
 @dataclass(frozen=True)
+class ImuConfig:
+    """Capacities of the inertial samples' arrays."""
+
+    buckets: tuple[int, ...] = (32, 64, 128, 256, 512, 1024, 2048)
+    """Padded numbers of samples between two scans; more than the last are thinned to it."""
+
+
+@dataclass(frozen=True)
 class MapConfig:
     """Capacity of the voxel map."""
 
@@ -89,6 +97,7 @@ class Config:
 
     data: DataConfig = field(default_factory=DataConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)
+    imu: ImuConfig = field(default_factory=ImuConfig)
     map: MapConfig = field(default_factory=MapConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
@@ -101,7 +110,7 @@ def invalid_config(path: str, value: object) -> str:
     """Return why a setting's value is impossible ("must be ..."), or nothing if it is possible."""
     if path == "config.map.capacity" and (not isinstance(value, int) or value < 2 or value & (value - 1)):
         return "must be a power of two"
-    if path == "config.lidar.buckets" and (sorted(set(value)) != list(value) or value[0] < 1):  # type: ignore
+    if path.endswith(".buckets") and (sorted(set(value)) != list(value) or value[0] < 1):  # type: ignore
         return "must be positive sizes in ascending order"
     if path == "config.data.vertical_correction_deg":
         return ""

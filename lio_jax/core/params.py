@@ -18,6 +18,42 @@ from lio_jax.core.types import state_dtype
 Scalar = Float[Array, ""]
 
 
+class ImuParams(eqx.Module):
+    """The inertial sensor's noise, as continuous-time densities."""
+
+    gyro_noise: Scalar
+    """White noise of the angular rate, rad/s/sqrt(Hz)."""
+    accel_noise: Scalar
+    """White noise of the specific force, m/s^2/sqrt(Hz)."""
+    gyro_bias_walk: Scalar
+    """Random walk of the gyroscope's bias, rad/s^2/sqrt(Hz)."""
+    accel_bias_walk: Scalar
+    """Random walk of the accelerometer's bias, m/s^3/sqrt(Hz)."""
+    gravity: Scalar
+    """Magnitude of gravity, m/s^2."""
+
+
+class InitialParams(eqx.Module):
+    """Standard deviations of the first navigation state; zero freezes that part of the state."""
+
+    rotation_sigma: Scalar
+    """Of roll and pitch, rad; the world's heading is the first pose's."""
+    velocity_sigma: Scalar
+    """m/s."""
+    gyro_bias_sigma: Scalar
+    """rad/s."""
+    accel_bias_sigma: Scalar
+    """m/s^2."""
+    gravity_sigma: Scalar
+    """Of gravity's direction, rad."""
+    extrinsic_rotation_sigma: Scalar
+    """Of T_imu_lidar's rotation, rad."""
+    extrinsic_translation_sigma: Scalar
+    """Of T_imu_lidar's translation, m."""
+    time_offset_sigma: Scalar
+    """s."""
+
+
 class LidarParams(eqx.Module):
     """The sensor's measurement model."""
 
@@ -75,6 +111,8 @@ class ExtrinsicsParams(eqx.Module):
     """Quaternion xyzw."""
     translation: Float[Array, "3"]
     """Position of the lidar in the IMU frame, m."""
+    time_offset: Scalar
+    """Lag of the lidar's clock, s: a scan stamped t was taken at IMU time t + time_offset."""
 
     def T_imu_lidar(self) -> jaxlie.SE3:
         """Return the pose of the lidar in the IMU frame."""
@@ -86,6 +124,8 @@ class ExtrinsicsParams(eqx.Module):
 class Params(eqx.Module):
     """All traced parameters of a recipe."""
 
+    imu: ImuParams
+    initial: InitialParams
     lidar: LidarParams
     map: MapParams
     registration: RegistrationParams
@@ -94,6 +134,23 @@ class Params(eqx.Module):
 
 
 DEFAULTS: dict[str, dict[str, Any]] = {
+    "imu": {
+        "gyro_noise": 2e-3,
+        "accel_noise": 2e-2,
+        "gyro_bias_walk": 2e-5,
+        "accel_bias_walk": 2e-4,
+        "gravity": 9.80665,
+    },
+    "initial": {
+        "rotation_sigma": 0.02,
+        "velocity_sigma": 0.1,
+        "gyro_bias_sigma": 0.01,
+        "accel_bias_sigma": 0.1,
+        "gravity_sigma": 0.0,
+        "extrinsic_rotation_sigma": 0.0,
+        "extrinsic_translation_sigma": 0.0,
+        "time_offset_sigma": 0.0,
+    },
     "lidar": {"range_sigma": 0.045, "min_range": 2.0, "max_range": 100.0},
     "map": {"voxel_size": 1.2, "point_spacing": 0.25, "min_points": 3.0, "reach": 120.0},
     "registration": {
@@ -105,7 +162,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "min_matches": 50.0,
     },
     "motion": {"initial_error": 2.0, "error_decay": 0.5},
-    "extrinsics": {"rotation": [0.0, 0.0, 0.0, 1.0], "translation": [0.0, 0.0, 0.0]},
+    "extrinsics": {"rotation": [0.0, 0.0, 0.0, 1.0], "translation": [0.0, 0.0, 0.0], "time_offset": 0.0},
 }
 """Values of the default recipe in the units of the leaves above."""
 
@@ -139,7 +196,9 @@ def values_from_params(params: Params) -> dict[str, dict[str, Any]]:
     }
 
 
+_ANY_SIGN = {"extrinsics.translation", "extrinsics.time_offset"}
 _MAY_BE_ZERO = {
+    *(f"initial.{name}" for name in DEFAULTS["initial"]),
     "lidar.min_range",
     "motion.initial_error",
     "registration.degeneracy_ratio",
@@ -155,7 +214,7 @@ def invalid_value(path: str, value: Any) -> str:
         path: section and name, such as ``lidar.range_sigma``.
         value: a finite number or a list of them.
     """
-    if path == "extrinsics.translation":
+    if path in _ANY_SIGN:
         return ""
     if path == "extrinsics.rotation":
         norm = sum(x * x for x in value) ** 0.5

@@ -46,8 +46,7 @@ class ImuBatch(eqx.Module):
 class NavState(eqx.Module):
     """What the estimator knows about the vehicle at a scan's end.
 
-    Error-state order, everywhere: rotation 3, position 3, velocity 3, gyro bias 3, accel bias 3, gravity 2,
-    extrinsic rotation 3, extrinsic translation 3.
+    Its error state is that of :mod:`lio_jax.core.error_state`.
     """
 
     T_world_imu: jaxlie.SE3
@@ -60,6 +59,8 @@ class NavState(eqx.Module):
     gravity: Float[Array, "3"]
     """In world, m/s^2; (0, 0, -g) once the world is levelled."""
     T_imu_lidar: jaxlie.SE3
+    time_offset: Float[Array, ""]
+    """Lag of the lidar's clock, s: a scan stamped t was taken at IMU time t + time_offset."""
 
 
 def initial_nav_state(T_imu_lidar: jaxlie.SE3, gravity_magnitude: float = 9.80665) -> NavState:
@@ -72,6 +73,7 @@ def initial_nav_state(T_imu_lidar: jaxlie.SE3, gravity_magnitude: float = 9.8066
         accel_bias=jnp.zeros(3, dtype),
         gravity=jnp.array([0.0, 0.0, -gravity_magnitude], dtype),
         T_imu_lidar=T_imu_lidar,
+        time_offset=jnp.zeros((), dtype),
     )
 
 

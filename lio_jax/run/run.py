@@ -55,7 +55,9 @@ class RunResult:
 
 def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list[str]]:
     """Take T_imu_lidar from the recording's calibration unless it was given; say where it came from."""
-    given = any(path.startswith("params.extrinsics") for path in settings.given)
+    given = any(
+        path.startswith(("params.extrinsics.rot", "params.extrinsics.trans")) for path in settings.given
+    )
     if given:
         unused = "" if sequence.info.T_imu_lidar is None else "; the recording's calibration is not used"
         return settings, [f"T_imu_lidar: as given in the settings{unused}."]

@@ -98,7 +98,11 @@ def test_quaternion_has_unit_norm():
 def test_extrinsic_pose_is_scipys():
     quaternion = Rotation.from_euler("xyz", [0.3, -0.8, 2.0]).as_quat()
     values = copy.deepcopy(DEFAULTS)
-    values["extrinsics"] = {"rotation": quaternion.tolist(), "translation": [1.0, -2.0, 3.0]}
+    values["extrinsics"] = {
+        "rotation": quaternion.tolist(),
+        "translation": [1.0, -2.0, 3.0],
+        "time_offset": 0.0,
+    }
     T = np.asarray(params_from_values(values).extrinsics.T_imu_lidar().as_matrix())
     np.testing.assert_allclose(T[:3, :3], Rotation.from_quat(quaternion).as_matrix(), atol=1e-12)
     np.testing.assert_array_equal(T[:3, 3], [1, -2, 3])

@@ -1,0 +1,104 @@
+"""The 24-dimensional error state of the navigation state: its order, retraction and inverse.
+
+Right perturbation: R Exp(dtheta), p + R dp, v + R dv (gtsam's NavState), biases and translations added,
+gravity turned on its sphere: g <- Exp(B du) g with B a basis of the plane normal to g.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from lio_jax.core.types import NavState
+
+DOF = 24
+ROTATION = slice(0, 3)
+"""rad, IMU frame."""
+POSITION = slice(3, 6)
+"""m, IMU frame."""
+VELOCITY = slice(6, 9)
+"""m/s, IMU frame."""
+GYRO_BIAS = slice(9, 12)
+"""rad/s."""
+ACCEL_BIAS = slice(12, 15)
+"""m/s^2."""
+GRAVITY = slice(15, 17)
+"""rad, about the two axes of ``sphere_basis``."""
+EXTRINSIC_ROTATION = slice(17, 20)
+"""rad, lidar frame."""
+EXTRINSIC_TRANSLATION = slice(20, 23)
+"""m, IMU frame."""
+TIME_OFFSET = slice(23, 24)
+"""s."""
+
+
+def retract(nav: NavState, error: Float[Array, "24"]) -> NavState:
+    """Return ``nav [+] error``."""
+    rotation = nav.T_world_imu.rotation()
+    turned = (rotation @ jaxlie.SO3.exp(error[ROTATION])).normalize()
+    position = nav.T_world_imu.translation() + rotation @ error[POSITION]
+    extrinsic = (nav.T_imu_lidar.rotation() @ jaxlie.SO3.exp(error[EXTRINSIC_ROTATION])).normalize()
+    return NavState(
+        T_world_imu=jaxlie.SE3.from_rotation_and_translation(turned, position),
+        velocity=nav.velocity + rotation @ error[VELOCITY],
+        gyro_bias=nav.gyro_bias + error[GYRO_BIAS],
+        accel_bias=nav.accel_bias + error[ACCEL_BIAS],
+        gravity=jaxlie.SO3.exp(sphere_basis(nav.gravity) @ error[GRAVITY]) @ nav.gravity,
+        T_imu_lidar=jaxlie.SE3.from_rotation_and_translation(
+            extrinsic, nav.T_imu_lidar.translation() + error[EXTRINSIC_TRANSLATION]
+        ),
+        time_offset=nav.time_offset + error[TIME_OFFSET][0],
+    )
+
+
+def local(origin: NavState, nav: NavState) -> Float[Array, "24"]:
+    """Return the error with ``retract(origin, error) == nav``: ``nav [-] origin``."""
+    rotation = origin.T_world_imu.rotation()
+    back = rotation.inverse()
+    extrinsic = origin.T_imu_lidar.rotation().inverse() @ nav.T_imu_lidar.rotation()
+    return jnp.concatenate(
+        [
+            (back @ nav.T_world_imu.rotation()).log(),
+            back @ (nav.T_world_imu.translation() - origin.T_world_imu.translation()),
+            back @ (nav.velocity - origin.velocity),
+            nav.gyro_bias - origin.gyro_bias,
+            nav.accel_bias - origin.accel_bias,
+            sphere_basis(origin.gravity).T @ _turn_between(origin.gravity, nav.gravity),
+            extrinsic.log(),
+            nav.T_imu_lidar.translation() - origin.T_imu_lidar.translation(),
+            (nav.time_offset - origin.time_offset)[None],
+        ]
+    )
+
+
+def sphere_basis(gravity: Float[Array, "3"]) -> Float[Array, "3 2"]:
+    """Return two unit axes normal to ``gravity`` and to each other, smooth near the vertical."""
+    up = -gravity / jnp.linalg.norm(gravity)
+    # the rotation that takes +z to up, applied to x and y; singular only for gravity that points up
+    a = 1 / (1 + up[2])
+    b = -up[0] * up[1] * a
+    return jnp.stack(
+        [
+            jnp.array([1 - up[0] ** 2 * a, b, -up[0]]),
+            jnp.array([b, 1 - up[1] ** 2 * a, -up[1]]),
+        ],
+        axis=1,
+    )
+
+
+def _turn_between(start: Float[Array, "3"], end: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Return the rotation vector that takes the direction of ``start`` to that of ``end``."""
+    normal = jnp.cross(start, end)
+    square = jnp.sum(normal**2)
+    # the ratio of angle and sine tends to 1 where the directions agree; two selections keep gradients finite
+    tiny = square < jnp.finfo(square.dtype).tiny ** 0.5
+    sine = jnp.sqrt(jnp.where(tiny, 1.0, square))
+    angle = jnp.arctan2(sine, jnp.dot(start, end))
+    return jnp.where(tiny, normal / jnp.sum(start**2), normal * angle / sine)
+
+
+class Uncertain(eqx.Module):
+    """A navigation state and the covariance of its error."""
+
+    nav: NavState
+    covariance: Float[Array, "24 24"]
