@@ -1,46 +1,111 @@
-"""A spinning multi-beam LiDAR: all beams of a column fire at once, the columns one after another."""
+"""One sweep of a LiDAR: every ray is cast from the pose that the sensor has at the ray's own firing time."""
+
+from abc import abstractmethod
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from numpy.typing import NDArray
 
 from lio_jax.sim.raycast import cast
-from lio_jax.sim.worlds import World
+from lio_jax.sim.worlds import Part
+
+_LN2 = 0.6931472
 
 
-class SpinningLidar(eqx.Module):
-    """Geometry, range limits and noise of the sensor."""
+class Ranging(eqx.Module):
+    """How a sensor measures distance, whatever its pattern."""
 
-    elevation: Float[Array, " beams"]
-    """Of each beam above the sensor's xy plane, from beam 0 upwards, rad."""
-    columns: int = eqx.field(static=True)
-    """Firings per turn."""
-    period: float = eqx.field(static=True)
-    """Duration of a turn, s."""
-    range_sigma: Float[Array, ""]
+    sigma: Float[Array, ""]
     """Standard deviation of a range, m."""
-    min_range: Float[Array, ""]
-    """m."""
-    max_range: Float[Array, ""]
-    """m."""
+    minimum: Float[Array, ""]
+    """Nearest range that is reported, m."""
+    maximum: Float[Array, ""]
+    """Farthest range that is reported, m."""
+    half_range: Float[Array, ""]
+    """Where a white surface met head-on answers every second time, m; inf for a sensor that misses nothing.
+
+    The chance of an answer is 1 - 2^-s with s = reflectivity * cos(incidence) * (half_range / range)^2, which
+    is proportional to the light that comes back: dark, slanted and far surfaces drop out.
+    """
+
+
+def ranging(
+    sigma: float = 0.02, minimum: float = 0.5, maximum: float = 100.0, half_range: float = float("inf")
+) -> Ranging:
+    """Return the range model with all lengths in m."""
+    return Ranging(*(jnp.float32(value) for value in (sigma, minimum, maximum, half_range)))
+
+
+class Lidar(eqx.Module):
+    """A sensor that fires column after column, the beams of a column one shortly after another."""
+
+    ranging: Ranging
+    columns: int = eqx.field(static=True)
+    """Firings of each beam in a sweep."""
+    period_ns: int = eqx.field(static=True)
+    """Duration of a sweep, ns."""
+    delay_ns: tuple[int, ...] = eqx.field(static=True)
+    """Of each beam after its column's time, ns, in firing order; the last is over before the next column."""
+    ring: tuple[int, ...] = eqx.field(static=True)
+    """Number of each beam as the sensor's driver reports it, in firing order."""
 
     @property
     def beams(self) -> int:
         """Number of beams."""
-        return self.elevation.shape[0]
+        return len(self.ring)
+
+    @property
+    def period(self) -> float:
+        """Duration of a sweep, s."""
+        return self.period_ns * 1e-9
+
+    @abstractmethod
+    def phase(self, start_ns: int) -> Float[Array, "2"]:
+        """Return what :meth:`directions` needs to know of a sweep's start, (2,) turns.
+
+        Args:
+            start_ns: of the sweep since the sensor was switched on, ns.
+        """
+
+    @abstractmethod
+    def directions(self, phase: Float[Array, "2"]) -> Float[Array, "columns beams 3"]:
+        """Return the unit direction of every ray in the lidar frame."""
+
+
+class SpinningLidar(Lidar):
+    """A head that turns clockwise seen from above, each sweep one turn from straight behind."""
+
+    elevation: Float[Array, " beams"]
+    """Above the sensor's xy plane, in firing order, rad."""
+    azimuth: Float[Array, " beams"]
+    """Ahead of the head's own direction, counter-clockwise, in firing order, rad."""
+
+    def phase(self, start_ns: int) -> Float[Array, "2"]:
+        """Return zeros: every turn is alike."""
+        return jnp.zeros(2, jnp.float32)
+
+    def directions(self, phase: Float[Array, "2"]) -> Float[Array, "columns beams 3"]:
+        """Return the unit directions: the head turns on between the beams of a column, too."""
+        turned = outer_sum(column_times_ns(self) / self.period_ns, np.array(self.delay_ns) / self.period_ns)
+        azimuth = jnp.pi - 2 * jnp.pi * turned + self.azimuth
+        level = jnp.cos(self.elevation)
+        up = jnp.broadcast_to(jnp.sin(self.elevation), azimuth.shape)
+        return jnp.stack([jnp.cos(azimuth) * level, jnp.sin(azimuth) * level, up], axis=-1)
 
 
 class Sweep(eqx.Module):
-    """One turn, column by column in firing order, misses included."""
+    """One sweep, column by column in firing order, misses included."""
 
     points: Float[Array, "columns beams 3"]
-    """Lidar frame at each column's own firing time, m."""
+    """Lidar frame at each ray's own firing time, m."""
     intensity: Float[Array, "columns beams"]
-    """Reflectivity times the cosine of incidence, 0 to 255."""
+    """Reflectivity times the cosine of incidence, 0 to 255 in whole steps."""
     mask: Bool[Array, "columns beams"]
-    """True where something within the range limits was met."""
+    """True where something within the range limits answered."""
 
 
 def spinning_lidar(
@@ -53,50 +118,114 @@ def spinning_lidar(
     min_range: float = 0.5,
     max_range: float = 100.0,
 ) -> SpinningLidar:
-    """Return a sensor with evenly spread beams; ranges in m, ``rate`` in turns per second."""
+    """Return an ideal sensor: beams evenly spread and fired at once, no dropouts.
+
+    Args:
+        beams: numbered from the lowest.
+        columns: firings a turn.
+        rate: turns per second.
+        elevation_deg: of the lowest and the highest beam.
+        range_sigma: standard deviation of a range, m.
+        min_range: m.
+        max_range: m.
+    """
     elevation = jnp.linspace(
         jnp.deg2rad(elevation_deg[0]), jnp.deg2rad(elevation_deg[1]), beams, dtype=jnp.float32
     )
-    limits = (jnp.float32(value) for value in (range_sigma, min_range, max_range))
-    return SpinningLidar(elevation, columns, 1.0 / rate, *limits)
+    return SpinningLidar(
+        ranging=ranging(range_sigma, min_range, max_range),
+        columns=columns,
+        period_ns=round(1e9 / rate),
+        delay_ns=(0,) * beams,
+        ring=tuple(range(beams)),
+        elevation=elevation,
+        azimuth=jnp.zeros(beams, jnp.float32),
+    )
 
 
-def column_times(lidar: SpinningLidar) -> Float[Array, " columns"]:
-    """Return the firing time of each column from the start of the turn, s."""
-    return jnp.arange(lidar.columns) * (lidar.period / lidar.columns)
+def column_times_ns(lidar: Lidar) -> NDArray[np.int64]:
+    """Return when each column starts to fire, (columns,) ns from the start of the sweep."""
+    return np.arange(lidar.columns, dtype=np.int64) * lidar.period_ns // lidar.columns
 
 
-def beam_directions(lidar: SpinningLidar) -> Float[Array, "columns beams 3"]:
-    """Return the unit directions in the lidar frame: clockwise from straight behind, as a Velodyne turns."""
-    azimuth = jnp.pi - 2 * jnp.pi * jnp.arange(lidar.columns, dtype=jnp.float32) / lidar.columns
-    level = jnp.cos(lidar.elevation)
-    x = jnp.cos(azimuth)[:, None] * level
-    y = jnp.sin(azimuth)[:, None] * level
-    z = jnp.broadcast_to(jnp.sin(lidar.elevation), x.shape)
-    return jnp.stack([x, y, z], axis=-1)
+def column_times(lidar: Lidar) -> NDArray[np.float64]:
+    """Return when each column starts to fire, (columns,) s from the start of the sweep."""
+    return np.asarray(column_times_ns(lidar) * 1e-9, np.float64)
 
 
-def sweep(lidar: SpinningLidar, world: World, T_world_column: jaxlie.SE3, key: PRNGKeyArray) -> Sweep:
-    """Return one noisy turn.
+def firing_times_ns(lidar: Lidar) -> NDArray[np.int64]:
+    """Return when each ray is fired, (columns, beams) ns from the start of the sweep, ascending."""
+    return column_times_ns(lidar)[:, None] + np.array(lidar.delay_ns, np.int64)
+
+
+def outer_sum(of_column: NDArray[np.float64], of_beam: NDArray[np.float64]) -> Float[Array, "columns beams"]:
+    """Return the float32 sum of a quantity of the column and one of the beam.
+
+    Only the two factors become constants of a compiled program, not one number a ray.
+    """
+    return jnp.asarray(of_column, jnp.float32)[:, None] + jnp.asarray(of_beam, jnp.float32)
+
+
+def sweep(
+    lidar: Lidar,
+    part: Part,
+    T_world_column: jaxlie.SE3,
+    key: PRNGKeyArray,
+    phase: Float[Array, "2"] | None = None,
+) -> Sweep:
+    """Return one noisy sweep.
 
     Args:
         lidar: the sensor.
-        world: what it sees, float32, near the origin.
-        T_world_column: lidar pose at each column's firing time, batch (columns,), float32.
-        key: of this turn's noise.
+        part: of a world, placed at the sweep's start, float32, near the origin.
+        T_world_column: lidar pose at each column's time, batch (columns,), float32.
+        key: of this sweep's noise.
+        phase: from ``lidar.phase``; None for a sensor whose sweeps are all alike.
 
     Returns:
-        The turn's points in the frame that the lidar had when each was measured.
+        The sweep's points in the frame that the lidar had when each was measured.
     """
-    directions = beam_directions(lidar)
+    directions = lidar.directions(jnp.zeros(2, jnp.float32) if phase is None else phase)
     shape = directions.shape[:2]
-    rotation = T_world_column.rotation().as_matrix()
-    origins = jnp.broadcast_to(T_world_column.translation()[:, None, :], directions.shape)
-    rays = jnp.einsum("cij,cbj->cbi", rotation, directions, precision=jax.lax.Precision.HIGHEST)
-    hit = cast(world, origins.reshape(-1, 3), rays.reshape(-1, 3))
-    mask = (hit.distance >= lidar.min_range) & (hit.distance <= lidar.max_range)
-    incidence = -jnp.sum(hit.normal * rays.reshape(-1, 3), axis=1)
-    noise = lidar.range_sigma * jax.random.normal(key, mask.shape, jnp.float32)
+    origins, rays = _rays(lidar, T_world_column, directions)
+    time = outer_sum(column_times(lidar), np.array(lidar.delay_ns) * 1e-9)
+    hit = cast(part, origins, rays, time.ravel())
+    model = lidar.ranging
+    cosine = -jnp.sum(hit.normal * rays, axis=1)
+    answer = hit.reflectivity * cosine
+    # 1 - 2^-s, by comparing an exponential draw with s: nothing is divided by a zero range or cosine
+    draw = jax.random.exponential(jax.random.fold_in(key, 1), answer.shape, jnp.float32) / _LN2
+    answered = draw * (hit.distance / model.half_range) ** 2 <= answer
+    mask = (hit.distance >= model.minimum) & (hit.distance <= model.maximum) & answered
+    noise = model.sigma * jax.random.normal(key, mask.shape, jnp.float32)
     measured = jnp.where(mask, hit.distance + noise, 0)
-    intensity = jnp.where(mask, 255 * hit.reflectivity * incidence, 0)
+    intensity = jnp.where(mask, jnp.round(255 * answer), 0)
     return Sweep(measured.reshape(*shape, 1) * directions, intensity.reshape(shape), mask.reshape(shape))
+
+
+def _rays(
+    lidar: Lidar, T_world_column: jaxlie.SE3, directions: Float[Array, "columns beams 3"]
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+    """Return origins and directions in the world.
+
+    Within a column the pose goes on linearly to the next column's: over h = 100 us this is off by
+    h^2/8 = 1.3e-9 s^2 times the acceleration, less than 1e-7 m.
+    """
+    rotation = T_world_column.rotation().as_matrix()
+    position = T_world_column.translation()
+    share = jnp.asarray(np.array(lidar.delay_ns) * lidar.columns / lidar.period_ns, jnp.float32)
+    origins = position[:, None] + share[:, None] * _step(position)[:, None]
+    rays = _turned(rotation, directions) + share[:, None] * _turned(_step(rotation), directions)
+    return origins.reshape(-1, 3), rays.reshape(-1, 3)
+
+
+def _turned(
+    rotation: Float[Array, "columns 3 3"], directions: Float[Array, "columns beams 3"]
+) -> Float[Array, "columns beams 3"]:
+    return jnp.einsum("cij,cbj->cbi", rotation, directions, precision=jax.lax.Precision.HIGHEST)
+
+
+def _step(values: Float[Array, "columns ..."]) -> Float[Array, "columns ..."]:
+    # the last column has no next one: it goes on as the one before it did
+    steps = jnp.diff(values, axis=0)
+    return jnp.concatenate([steps, steps[-1:]])

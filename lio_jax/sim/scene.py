@@ -19,8 +19,8 @@ class Route:
     points: NDArray[np.float64]
     """(n, 3) vertices in driving order, world frame, m; the route starts at the first."""
     closed: bool
-    """Whether the last vertex is joined to the first, to be driven lap after lap; an open route is driven to its
-    end and back again, facing the same way."""
+    """Whether the last vertex is joined to the first, to be driven lap after lap; an open route is driven to
+    its end and back again, facing the same way."""
     radius: float
     """Of the rounded corners, m."""
     speed: float

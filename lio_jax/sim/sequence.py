@@ -1,7 +1,8 @@
-"""A simulated drive as a Sequence: scans are ray cast when they are asked for."""
+"""A simulated recording as a Sequence: scans are ray cast when they are asked for."""
 
+import math
 from collections.abc import Iterator
-from functools import partial
+from functools import cached_property
 from typing import Any
 
 import equinox as eqx
@@ -11,77 +12,125 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import UsageError
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
 from lio_jax.data.trajectory import Trajectory
-from lio_jax.sim.lidar import SpinningLidar, Sweep, column_times, spinning_lidar, sweep
-from lio_jax.sim.street import street
-from lio_jax.sim.trajectory import Drive, pose_at
-from lio_jax.sim.worlds import World, counts_within, nearest_part
-
-WORLDS = {"street": street}
-"""Name to builder: ``builder(seed) -> (World, Drive)``."""
+from lio_jax.sim.collision import STEP, TOGETHER, check_clear
+from lio_jax.sim.gps import GpsModel, simulate_gps
+from lio_jax.sim.imu import GRAVITY, ImuModel, ImuTruth, simulate_imu
+from lio_jax.sim.lidar import Lidar, Sweep, column_times, firing_times_ns, spinning_lidar, sweep
+from lio_jax.sim.livox_pattern import RosetteLidar
+from lio_jax.sim.sensors import Layout, find_sensor
+from lio_jax.sim.trajectory import Motion, motion_along, motion_through, pose_at
+from lio_jax.sim.world_registry import build
+from lio_jax.sim.worlds import Counts, Part, World, counts_along, nearest_part
 
 EPOCH_NS = 1_700_000_000_000_000_000
-"""Absolute time of the drive's start, ns."""
+"""Absolute time of the recording's start, ns."""
 
 _TRUTH_STEP_NS = 10_000_000
+_POSES_AT_ONCE = 4096
+_STANDSTILL = 1.5
+"""Before pulling away unless asked otherwise, s."""
+_DURATION = 10.0
+"""Unless asked otherwise, s."""
 
 
 class SimulatedSequence:
-    """A drive through a simulated world with exact truth; a scan depends on the seed and its number only."""
+    """A drive, walk or flight through a simulated world with exact truth.
+
+    A scan depends on the arguments and its number only, not on which scans were asked for before.
+    """
 
     def __init__(
         self,
         world: str = "street",
-        beams: int = 32,
-        columns: int = 1024,
-        duration_s: float = 10.0,
+        sensor: str | Lidar = "generic32",
+        duration_s: float | None = None,
         seed: int = 0,
+        *,
+        beams: int | None = None,
+        columns: int | None = None,
+        imu: ImuModel | None = None,
+        gps: GpsModel | None = None,
+        standstill_s: float | None = None,
+        moving_start: bool = False,
+        trajectory: Trajectory | None = None,
+        T_imu_lidar: NDArray[np.floating[Any]] | None = None,
     ) -> None:
-        """Build the world; nothing is ray cast yet.
+        """Build the world and check that the motion is free; no scan is ray cast yet.
 
         Args:
-            world: a name of ``WORLDS``.
-            beams: of the spinning LiDAR.
-            columns: firings per turn.
-            duration_s: of the drive, s; whole turns only.
-            seed: of world and noise.
+            world: a name of ``world_registry.WORLDS``.
+            sensor: a name of ``sensors.SENSORS``, or a sensor.
+            duration_s: of the recording, s; whole sweeps only. None: the whole ``trajectory``, or 10 s.
+            seed: of world, motion and noise.
+            beams: of the sensor "generic32"; None: 32.
+            columns: firings per turn of the sensor "generic32"; None: 1024.
+            imu: the inertial sensor; None: the recording has none.
+            gps: the GPS receiver; None: the recording has none.
+            standstill_s: time at rest at the start of the world's route, s; None: 1.5, or 0 if moving.
+            moving_start: whether the recording starts at full speed on the world's route.
+            trajectory: T_world_imu to pass through instead of the world's route, from its first pose on.
+            T_imu_lidar: (4, 4) pose of the lidar in the IMU frame; None: a small lever arm and rotation.
 
         Raises:
-            UsageError: the world is unknown or the drive is shorter than one turn.
+            UsageError: an unknown world or sensor, an impossible duration or extrinsic, or a motion that runs
+                into something.
         """
-        if world not in WORLDS:
-            raise UsageError(f"world '{world}' is unknown; choose one of: {', '.join(sorted(WORLDS))}.")
-        self.lidar = spinning_lidar(beams, columns)
-        count = int(duration_s / self.lidar.period + 1e-6)
-        if count < 1:
+        scene = build(world, seed)
+        self.lidar, self.lidar_layout, description = _sensor(sensor, beams, columns)
+        if duration_s is None:
+            duration_s = _span(trajectory) if trajectory is not None else _DURATION
+        if not self.lidar.period - 1e-9 <= duration_s < math.inf:
             raise UsageError(
-                f"a duration of {duration_s} s holds no scan; give at least {self.lidar.period} s (one turn)."
+                f"a duration of {duration_s} s holds no scan; give at least {self.lidar.period:g} s, a sweep."
             )
-        # states in double precision whatever the caller's setting: truth is truth
+        self.world = scene.world
+        if trajectory is None:
+            rest = _STANDSTILL * (not moving_start) if standstill_s is None else standstill_s
+            self.motion: Motion = motion_along(
+                scene.route, duration_s=duration_s, standstill_s=rest, moving_start=moving_start, seed=seed
+            )
+        else:
+            if moving_start or standstill_s:
+                raise UsageError(
+                    "a trajectory itself says when it moves; leave standstill and moving start out."
+                )
+            if duration_s > _span(trajectory) + 1e-9:
+                raise UsageError(
+                    f"the trajectory ends after {_span(trajectory):.2f} s, before the wanted {duration_s} s; "
+                    "shorten the duration."
+                )
+            self.motion = motion_through(trajectory)
+        self._seed, self._imu_model, self._gps_model = seed, imu, gps
+        extrinsic = _extrinsic(T_imu_lidar)
+        # the motion is in double precision whatever the caller's setting: truth is truth
         with jax.enable_x64(True):
-            self.world, self.drive = WORLDS[world](seed)
-            self._T_imu_lidar = jaxlie.SE3.from_rotation_and_translation(
-                jaxlie.SO3.from_rpy_radians(*jnp.deg2rad(jnp.array([0.6, -1.2, 2.5]))),
-                jnp.array([0.1, 0.0, 0.2]),
-            )
-            T_imu_lidar = np.asarray(self._T_imu_lidar.as_matrix())
+            wxyz = Rotation.from_matrix(extrinsic[:3, :3]).as_quat(scalar_first=True)
+            self._T_imu_lidar = jaxlie.SE3(jnp.asarray(np.concatenate([wxyz, extrinsic[:3, 3]])))
         self._noise_key = jax.random.fold_in(jax.random.key(seed), 1)
-        self._period_ns = round(self.lidar.period * 1e9)
+        sigma = float(self.lidar.ranging.sigma)
         self.info = SequenceInfo(
             name=f"{world}_{seed}",
             format="simulated",
             path="",
-            scan_count=count,
-            T_imu_lidar=T_imu_lidar,
-            sensor=f"simulated, {beams} beams x {columns} columns",
-            notes=(
-                f"{world} world, seed {seed}: ray cast, range noise {float(self.lidar.range_sigma):g} m.",
-            ),
+            scan_count=int(duration_s / self.lidar.period + 1e-6),
+            T_imu_lidar=extrinsic,
+            sensor=f"simulated, {description}",
+            notes=(f"{world} world, seed {seed}: ray cast, range noise {sigma:g} m.",),
         )
-        self._part_counts = self._counts_in_range()
+        times = np.arange(0.0, self.duration_s, STEP)
+        positions = self.poses(times)[:, :3, 3]
+        check_clear(self.world, times, positions)
+        self._counts = self._counts_in_range(positions)
+
+    @property
+    def duration_s(self) -> float:
+        """Return the length of the recording, s: a whole number of sweeps."""
+        return self.info.scan_count * self.lidar.period_ns * 1e-9
 
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
         """Ray cast and yield scans ``start`` to ``start + count``."""
@@ -90,85 +139,162 @@ class SimulatedSequence:
             yield self._scan(number)
 
     def imu(self) -> ImuData | None:
-        """Return None: inertial samples are not simulated."""
-        return None
+        """Return the inertial samples, or None where no IMU was asked for."""
+        return self._inertial[0] if self._inertial else None
 
     def gps(self) -> GpsData | None:
-        """Return None: GPS is not simulated."""
-        return None
+        """Return the GPS fixes, or None where no GPS was asked for."""
+        if self._gps_model is None:
+            return None
+        return simulate_gps(self.motion, self._gps_model, self.duration_s, self._seed, EPOCH_NS)
 
     def truth(self) -> Trajectory:
         """Return T_world_imu every 10 ms from the first scan's start to the last scan's end."""
-        steps = self.info.scan_count * self._period_ns // _TRUTH_STEP_NS
+        steps = self.info.scan_count * self.lidar.period_ns // _TRUTH_STEP_NS
         offsets = np.arange(steps + 1, dtype=np.int64) * _TRUTH_STEP_NS
         return Trajectory(EPOCH_NS + offsets, self.poses(offsets * 1e-9))
 
+    def truth_arrays(self) -> dict[str, NDArray[Any]]:
+        """Return what an estimator may want to know besides the poses, by name.
+
+        ``T_imu_lidar`` (4, 4), ``range_sigma`` (m), ``gravity`` (3,) in world (m/s^2), and with an IMU its
+        true biases, noise densities and time offset as :class:`~lio_jax.sim.imu.ImuTruth` names them.
+        """
+        known: dict[str, NDArray[Any]] = {
+            "T_imu_lidar": np.asarray(self.info.T_imu_lidar),
+            "range_sigma": np.asarray(self.lidar.ranging.sigma, np.float64),
+            "gravity": GRAVITY,
+        }
+        return known | (self._inertial[1].arrays() if self._inertial else {})
+
     @property
     def warnings_so_far(self) -> tuple[str, ...]:
-        """Return nothing: a simulated drive has no faults."""
+        """Return nothing: a simulated recording has no faults."""
         return ()
 
     def poses(self, times: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-        """Return (n, 4, 4) T_world_imu at ``times`` s from the drive's start, in double precision."""
+        """Return (n, 4, 4) T_world_imu at ``times`` s from the recording's start, in double precision."""
+        times = np.asarray(times, np.float64)
+        found = []
         with jax.enable_x64(True):
-            return np.asarray(_poses(self.drive, jnp.asarray(times, jnp.float64)).as_matrix())
+            # in pieces of one shape: one compiled program, and no more memory for an hour than for a minute
+            for start in range(0, len(times), _POSES_AT_ONCE):
+                piece = times[start : start + _POSES_AT_ONCE]
+                padded = np.pad(piece, (0, _POSES_AT_ONCE - len(piece)), mode="edge")
+                found.append(np.asarray(_poses(self.motion, jnp.asarray(padded)))[: len(piece)])
+        return np.concatenate(found) if found else np.empty((0, 4, 4))
+
+    @cached_property
+    def _inertial(self) -> tuple[ImuData, ImuTruth] | None:
+        if self._imu_model is None:
+            return None
+        return simulate_imu(self.motion, self._imu_model, self.duration_s, self._seed, EPOCH_NS)
 
     def _scan(self, number: int) -> LidarScan:
+        start_ns = number * self.lidar.period_ns
         with jax.enable_x64(True):
-            start = jnp.float64(number * self._period_ns * 1e-9)
-            columns, center = _column_poses(self.drive, self._T_imu_lidar, start, self.lidar)
-        key = jax.random.fold_in(self._noise_key, number)
-        turn = _turn(self.lidar, self.world, columns, center, key, self._part_counts)
-        mask = np.asarray(turn.mask)
-        times = np.asarray(column_times(self.lidar), np.float32)
+            start = jnp.float64(start_ns * 1e-9)
+            part, columns = _surroundings(
+                self.world, self.motion, self._T_imu_lidar, start, self.lidar, self._counts
+            )
+            key = jax.random.fold_in(self._noise_key, number)
+            seen = _sweep(self.lidar, part, columns, key, self.lidar.phase(start_ns))
+        mask = np.asarray(seen.mask)
+        times = (firing_times_ns(self.lidar) * 1e-9).astype(np.float32)
         return LidarScan(
-            stamp_ns=EPOCH_NS + number * self._period_ns,
-            points=np.asarray(turn.points)[mask],
-            time=np.broadcast_to(times[:, None], mask.shape)[mask],
-            ring=np.broadcast_to(np.arange(mask.shape[1], dtype=np.int32), mask.shape)[mask],
-            intensity=np.asarray(turn.intensity)[mask],
+            stamp_ns=EPOCH_NS + start_ns,
+            points=np.asarray(seen.points)[mask],
+            time=times[mask],
+            ring=np.broadcast_to(np.array(self.lidar.ring, np.int32), mask.shape)[mask],
+            intensity=np.asarray(seen.intensity)[mask],
             duration=self.lidar.period,
         )
 
-    def _counts_in_range(self) -> tuple[int, int]:
-        """Return how many boxes and cylinders the sensor can have in range at once, anywhere on the drive."""
-        duration = self.info.scan_count * self.lidar.period
-        positions = self.poses(np.arange(int(duration) + 2) * 1.0)[:, :3, 3].astype(np.float32)
-        # positions are sampled once a second: the margin covers what is driven in between
-        radius = float(self.lidar.max_range) + 15.0
-        counts = np.asarray(_all_counts(self.world, jnp.asarray(positions), jnp.float32(radius))).max(axis=0)
-        return int(counts[0]), int(counts[1])
+    def _counts_in_range(self, positions: NDArray[np.float64]) -> Counts:
+        """Return how many solids of each kind the sensor can have in range at once, anywhere on its way."""
+        # as many as the collision check counts at: one compiled program
+        sampled = positions[::TOGETHER]
+        driven = np.linalg.norm(np.diff(sampled, axis=0, append=positions[-1:]), axis=1).max()
+        lever = np.linalg.norm(np.asarray(self.info.T_imu_lidar)[:3, 3])
+        # what is driven between the samples, and within a sweep that starts at one
+        margin = 2 * driven + lever + 1.0
+        radius = float(self.lidar.ranging.maximum + margin)
+        counts = counts_along(self.world, jnp.asarray(sampled, jnp.float32), radius)
+        return Counts(*(_rounded_up(int(count)) for count in counts))
+
+
+def _sensor(sensor: str | Lidar, beams: int | None, columns: int | None) -> tuple[Lidar, Layout, str]:
+    if sensor == "generic32" and (beams or columns):
+        chosen = spinning_lidar(beams or 32, columns or 1024)
+        return chosen, "velodyne", f"ideal, {chosen.beams} beams x {chosen.columns} columns"
+    if beams or columns:
+        raise UsageError(f"sensor {sensor}: beams and columns can be set for generic32 only; leave them out.")
+    if isinstance(sensor, str):
+        found = find_sensor(sensor)
+        return found.build(), found.layout, found.description
+    layout: Layout = "livox" if isinstance(sensor, RosetteLidar) else "velodyne"
+    return sensor, layout, f"{sensor.beams} beams x {sensor.columns} columns"
+
+
+def _rounded_up(count: int) -> int:
+    """Return up to 14 % more, so that most seeds and durations of a world share one compiled program."""
+    step = max(1, 2 ** (count.bit_length() - 4))
+    return -(-count // step) * step
+
+
+def _span(trajectory: Trajectory) -> float:
+    return float(trajectory.stamp_ns[-1] - trajectory.stamp_ns[0]) * 1e-9 if len(trajectory) else 0.0
+
+
+def _extrinsic(T_imu_lidar: NDArray[np.floating[Any]] | None) -> NDArray[np.float64]:
+    """Return the (4, 4) pose as given, or the default."""
+    if T_imu_lidar is None:
+        default = np.eye(4)
+        default[:3, :3] = Rotation.from_euler("xyz", [0.6, -1.2, 2.5], degrees=True).as_matrix()
+        default[:3, 3] = [0.1, 0.0, 0.2]
+        return default
+    matrix = np.asarray(T_imu_lidar, np.float64)
+    rotation = matrix[:3, :3]
+    if matrix.shape != (4, 4) or not (
+        np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
+    ):
+        raise UsageError(
+            "T_imu_lidar is not a rigid transform; give a 4x4 with a rotation in its upper left."
+        )
+    return matrix
 
 
 @jax.jit
-def _poses(drive: Drive, times: Float[Array, " n"]) -> jaxlie.SE3:
-    return jax.vmap(partial(pose_at, drive))(times)
-
-
-@jax.jit
-def _all_counts(world: World, positions: Float[Array, "n 3"], radius: Float[Array, ""]) -> Array:
-    return jax.vmap(lambda position: counts_within(world, position, radius))(positions)
-
-
-@jax.jit
-def _column_poses(
-    drive: Drive, T_imu_lidar: jaxlie.SE3, start: Float[Array, ""], lidar: SpinningLidar
-) -> tuple[jaxlie.SE3, Float[Array, "3"]]:
-    """Return float32 lidar poses at the firing times, relative to the position where the turn starts."""
-    poses = jax.vmap(lambda time: pose_at(drive, time) @ T_imu_lidar)(start + column_times(lidar))
-    center = poses.translation()[0]
-    local = jaxlie.SE3.from_rotation_and_translation(poses.rotation(), poses.translation() - center)
-    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), local), center.astype(jnp.float32)
+def _poses(motion: Motion, times: Float[Array, " n"]) -> Float[Array, "n 4 4"]:
+    return jax.vmap(lambda time: pose_at(motion, time).as_matrix())(times)
 
 
 @eqx.filter_jit
-def _turn(
-    lidar: SpinningLidar,
+def _surroundings(
     world: World,
-    columns: jaxlie.SE3,
-    center: Float[Array, "3"],
-    key: PRNGKeyArray,
-    part_counts: tuple[int, int],
+    motion: Motion,
+    T_imu_lidar: jaxlie.SE3,
+    start: Float[Array, ""],
+    lidar: Lidar,
+    counts: Counts,
+) -> tuple[Part, jaxlie.SE3]:
+    """Return what is in range and the lidar poses at the columns' times, float32.
+
+    Both are relative to where the lidar is at the sweep's start, and rounded only then: float32 holds a
+    distance of 100 m to 1e-5 m, but not a coordinate in a large world.
+    """
+    times = start + jnp.asarray(column_times(lidar))
+    poses = jax.vmap(lambda time: pose_at(motion, time) @ T_imu_lidar)(times)
+    center = poses.translation()[0]
+    local = jaxlie.SE3.from_rotation_and_translation(poses.rotation(), poses.translation() - center)
+    part, _ = nearest_part(world, center, start, counts)
+    return jax.tree.map(
+        lambda leaf: leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf, (part, local)
+    )
+
+
+@eqx.filter_jit
+def _sweep(
+    lidar: Lidar, part: Part, columns: jaxlie.SE3, key: PRNGKeyArray, phase: Float[Array, "2"]
 ) -> Sweep:
-    part, _ = nearest_part(world, center, *part_counts)
-    return sweep(lidar, part, columns, key)
+    return sweep(lidar, part, columns, key, phase)

@@ -1,30 +1,27 @@
-"""A car-like drive on a closed quintic B-spline: closed form, four times continuously differentiable in time.
+"""How the body moves: a pose for every instant, three times continuously differentiable at least.
 
-Every derivative (velocity, acceleration, body rates) follows by ``jax.jvp`` of :func:`pose_at`.
+Velocity, acceleration and angular rate follow exactly, by ``jax.jvp`` of :func:`pose_at`. All of it is
+float64: call it in JAX's x64 mode (``jax.enable_x64``).
 """
 
+from typing import TypeAlias
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import NDArray
 
+from lio_jax.core.errors import UsageError
+from lio_jax.data.trajectory import Trajectory
+from lio_jax.sim.dynamics import HANDLING, Sway, bank_angles, sway
+from lio_jax.sim.pose_spline import PoseSpline, spline_through
+from lio_jax.sim.route_smoothing import timed_path
+from lio_jax.sim.scene import Route
 
-class Drive(eqx.Module):
-    """A lap on a closed path: standing first, then pulling away, then lap after lap."""
-
-    control: Float[Array, "n 2"]
-    """Control points of the closed path, world frame, m; their spacing sets the speed."""
-    knot_rate: Float[Array, ""]
-    """Control points passed per second at full speed."""
-    standstill: Float[Array, ""]
-    """Time at rest before pulling away, s."""
-    pull_away: Float[Array, ""]
-    """Time from rest to full speed, s."""
-    sway: Float[Array, "3 2"]
-    """Amplitude and frequency (Hz) of the body's heave (m), roll (rad) and pitch (rad) at full speed."""
-
+_SMOOTHSTEP_PEAK = 35 / 16
+"""Largest slope of the smoothstep."""
 
 _QUINTIC = (
     np.array(
@@ -42,36 +39,187 @@ _QUINTIC = (
 """Uniform quintic B-spline: a control point's weight per row, ascending powers of the knot's fraction."""
 
 
-def pose_at(drive: Drive, time: Float[Array, ""]) -> jaxlie.SE3:
-    """Return T_world_body at ``time`` s from the drive's start; body x forward, y left, z up."""
-    elapsed = (time - drive.standstill) / drive.pull_away
-    knots = drive.knot_rate * drive.pull_away * _smoothstep_integral(elapsed)
-    position, tangent = _spline(drive.control, knots)
-    amplitude, frequency = drive.sway.T
-    phase = 2 * jnp.pi * frequency * (time - drive.standstill)
-    heave, roll, pitch = amplitude * jnp.sin(phase) * _smoothstep(elapsed)
-    rotation = (
-        jaxlie.SO3.from_z_radians(jnp.arctan2(tangent[1], tangent[0]))
-        @ jaxlie.SO3.from_y_radians(pitch)
-        @ jaxlie.SO3.from_x_radians(roll)
+class RouteMotion(eqx.Module):
+    """Along a route: standing first, then pulling away; lap after lap, or to the end and back."""
+
+    control: Float[Array, "n 4"]
+    """Control points x, y, z (world frame, m) and roll at full speed (rad); their spacing sets the speed."""
+    sway: Sway
+    """Added to the path once it moves."""
+    knot_rate: Float[Array, ""]
+    """Control points passed per second at full speed."""
+    standstill: Float[Array, ""]
+    """When it pulls away, s; negative: it did so before time 0."""
+    pull_away: Float[Array, ""]
+    """Time from rest to full speed, s."""
+    climb: Float[Array, ""]
+    """1 where the body pitches with the slope of its path, 0 where it stays level."""
+    duration: Float[Array, ""]
+    """The motion is meant for 0 to this time, s, though it never ends."""
+    closed: bool = eqx.field(static=True)
+    """Whether the path is a loop."""
+
+    def pose(self, time: Float[Array, ""]) -> jaxlie.SE3:
+        """Return T_world_imu at ``time`` s; body x forward, y left, z up."""
+        knots, pace, moving = self._progress(time)
+        place, tangent = self._path(knots)
+        yaw = jnp.arctan2(tangent[1], tangent[0])
+        slope = jnp.arctan2(tangent[2], jnp.sqrt(tangent[0] ** 2 + tangent[1] ** 2))
+        forward, left, up, roll, pitch, turn = moving * self.sway.at(time - self.standstill)
+        cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+        offset = jnp.stack([cos * forward - sin * left, sin * forward + cos * left, up])
+        quaternion = _yaw_pitch_roll(yaw + turn, pitch - self.climb * slope, roll + pace**2 * place[3])
+        return jaxlie.SE3(jnp.concatenate([quaternion, place[:3] + offset]))
+
+    def _progress(self, time: Float[Array, ""]) -> tuple[Array, Array, Array]:
+        """Return the knots passed, the share of full speed, and the share to which it has set off."""
+        elapsed = (time - self.standstill) / self.pull_away
+        per_unit = self.knot_rate * self.pull_away
+        moving = _smoothstep(elapsed)
+        if self.closed:
+            return per_unit * _smoothstep_integral(elapsed), moving, moving
+        # there and back, slowing to a stop at both ends; a way too short for full speed never reaches it
+        cruise = (self.control.shape[0] - 6) / per_unit
+        way = cruise + 1
+        phase = jnp.mod(jnp.maximum(elapsed, 0), 2 * way)
+        folded = jnp.where(phase < way, phase, 2 * way - phase)
+        passed = _smoothstep_integral(folded) - _smoothstep_integral(folded - cruise)
+        return per_unit * passed, _smoothstep(folded) - _smoothstep(folded - cruise), moving
+
+    def _path(self, knots: Float[Array, ""]) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
+        """Return the spline's value and its slope per knot."""
+        count = self.control.shape[0]
+        if self.closed:
+            first = jnp.floor(knots)
+            index = (first.astype(jnp.int32) + jnp.arange(-2, 4)) % count
+        else:
+            first = jnp.clip(jnp.floor(knots), 0, count - 6)
+            index = first.astype(jnp.int32) + jnp.arange(6)
+        fraction = knots - first
+        # Horner on static coefficients: a traced power has no derivative at 0
+        coefficients = self.control[index].T @ jnp.asarray(_QUINTIC, self.control.dtype)
+        value, slope = coefficients[:, 5], 5 * coefficients[:, 5]
+        for order in range(4, -1, -1):
+            value = value * fraction + coefficients[:, order]
+            if order > 0:
+                slope = slope * fraction + order * coefficients[:, order]
+        return value, slope
+
+
+Motion: TypeAlias = RouteMotion | PoseSpline
+"""Anything with a ``duration`` and a pose for every instant."""
+
+
+class Kinematics(eqx.Module):
+    """The body's state at an instant."""
+
+    T_world_imu: jaxlie.SE3
+    velocity: Float[Array, "3"]
+    """Of the IMU origin, in world, m/s."""
+    acceleration: Float[Array, "3"]
+    """Of the IMU origin, in world, without gravity, m/s^2."""
+    angular_velocity: Float[Array, "3"]
+    """Of the body, in the IMU frame, rad/s."""
+
+
+def pose_at(motion: Motion, time: Float[Array, ""]) -> jaxlie.SE3:
+    """Return T_world_imu at ``time`` s from the motion's start."""
+    return motion.pose(time)
+
+
+def kinematics_at(motion: Motion, time: Float[Array, ""]) -> Kinematics:
+    """Return pose, velocity, acceleration and angular velocity at ``time`` s, exactly."""
+    one = jnp.ones_like(time)
+
+    def moving(instant: Float[Array, ""]) -> tuple[Float[Array, "7"], Float[Array, "7"]]:
+        return jax.jvp(lambda t: pose_at(motion, t).wxyz_xyz, (instant,), (one,))
+
+    (value, rate), (_, second) = jax.jvp(moving, (time,), (one,))
+    # of the unit quaternion q: omega = 2 q* dq/dt
+    turning = jaxlie.SO3(value[:4]).inverse().wxyz
+    angular = 2 * jaxlie.SO3(turning).multiply(jaxlie.SO3(rate[:4])).wxyz[1:]
+    return Kinematics(jaxlie.SE3(value), rate[4:], second[4:], angular)
+
+
+def motion_along(
+    route: Route,
+    *,
+    duration_s: float,
+    standstill_s: float = 0.0,
+    moving_start: bool = False,
+    seed: int = 0,
+    swing_rate: float = 0.8,
+) -> RouteMotion:
+    """Return the motion of a body along a route.
+
+    Args:
+        route: where to, how fast, and what kind of body.
+        duration_s: of the recording, s.
+        standstill_s: time at rest before it pulls away, s.
+        moving_start: whether it is at full speed at time 0, having pulled away from the route's start before.
+        seed: of the sway.
+        swing_rate: how fast a handheld body looks around, rad/s; 4 is as fast as a wrist can.
+
+    Returns:
+        A float64 motion, whatever JAX's mode.
+
+    Raises:
+        UsageError: an impossible duration, standstill or swing rate, a route that cannot be followed.
+    """
+    if not duration_s > 0:
+        raise UsageError(f"a duration of {duration_s} s holds nothing; give more than 0 s.")
+    if not standstill_s >= 0:
+        raise UsageError(f"a standstill of {standstill_s} s is impossible; give 0 s or more.")
+    if moving_start and standstill_s > 0:
+        raise UsageError(
+            f"a standstill of {standstill_s} s contradicts a moving start; choose one of the two."
+        )
+    if not 0 <= swing_rate <= 10:
+        raise UsageError(f"a swing rate of {swing_rate} rad/s is impossible; give 0 to 10 rad/s.")
+    handling = HANDLING[route.dynamics]
+    control, knot_rate = timed_path(route, handling.lateral, handling.braking)
+    roll = bank_angles(control, knot_rate, route.dynamics, route.closed)
+    pull_away = _SMOOTHSTEP_PEAK * route.speed / handling.acceleration
+    with jax.enable_x64(True):
+        return RouteMotion(
+            control=jnp.asarray(np.column_stack([control, roll])),
+            sway=sway(route.dynamics, swing_rate, seed),
+            knot_rate=jnp.float64(knot_rate),
+            standstill=jnp.float64(-pull_away if moving_start else standstill_s),
+            pull_away=jnp.float64(pull_away),
+            climb=jnp.float64(handling.climbs),
+            duration=jnp.float64(duration_s),
+            closed=route.closed,
+        )
+
+
+def motion_through(trajectory: Trajectory) -> PoseSpline:
+    """Return the smooth motion that meets every pose of a trajectory; time 0 is its first stamp.
+
+    Returns:
+        A float64 motion, whatever JAX's mode.
+
+    Raises:
+        LioJaxError: the poses cannot be joined smoothly (see :func:`spline_through`).
+    """
+    with jax.enable_x64(True):
+        return spline_through(trajectory)
+
+
+def _yaw_pitch_roll(
+    yaw: Float[Array, ""], pitch: Float[Array, ""], roll: Float[Array, ""]
+) -> Float[Array, "4"]:
+    """Return the quaternion wxyz of Rz(yaw) Ry(pitch) Rx(roll), written out to keep its derivatives short."""
+    angles = jnp.stack([roll, pitch, yaw]) / 2
+    (cx, cy, cz), (sx, sy, sz) = jnp.cos(angles), jnp.sin(angles)
+    return jnp.stack(
+        [
+            cz * cy * cx + sz * sy * sx,
+            cz * cy * sx - sz * sy * cx,
+            cz * sy * cx + sz * cy * sx,
+            sz * cy * cx - cz * sy * sx,
+        ]
     )
-    return jaxlie.SE3.from_rotation_and_translation(rotation, jnp.append(position, heave))
-
-
-def _spline(
-    control: Float[Array, "n 2"], knots: Float[Array, ""]
-) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-    first = jnp.floor(knots)
-    fraction = knots - first
-    rows = control[(first.astype(jnp.int32) + jnp.arange(-2, 4)) % control.shape[0]]
-    # Horner on static coefficients: a traced power has no derivative at 0
-    coefficients = rows.T @ jnp.asarray(_QUINTIC, control.dtype)
-    position, tangent = coefficients[:, 5], 5 * coefficients[:, 5]
-    for order in range(4, -1, -1):
-        position = position * fraction + coefficients[:, order]
-        if order > 0:
-            tangent = tangent * fraction + order * coefficients[:, order]
-    return position, tangent
 
 
 def _smoothstep(x: Float[Array, ""]) -> Float[Array, ""]:
@@ -83,75 +231,3 @@ def _smoothstep_integral(x: Float[Array, ""]) -> Float[Array, ""]:
     # from 0 to 1 the polynomial's integral, 1/2 at the end; then the full rate
     ramp = jnp.clip(x, 0, 1)
     return ramp**5 * (7 + ramp * (-14 + ramp * (10 - 2.5 * ramp))) + jnp.maximum(x - 1, 0)
-
-
-def rounded_lap(
-    corners: NDArray[np.float64],
-    radius: float,
-    start: NDArray[np.float64],
-    spacing: float,
-    corner_spacing: float,
-) -> NDArray[np.float64]:
-    """Return the control points of a closed path along ``corners`` with rounded turns.
-
-    Args:
-        corners: (m, 2) vertices in driving order, m.
-        radius: of the turns, m.
-        start: (2,) point of the path where the lap begins, m.
-        spacing: of the control points on straights, m.
-        corner_spacing: of the control points in turns, m: smaller is slower.
-
-    Returns:
-        (n, 2) m; n follows from the spacings, which are scaled a little to close the lap.
-    """
-    path, turning = _rounded_polygon(corners, radius)
-    first = int(np.argmin(np.linalg.norm(path - start, axis=1)))
-    path, turning = np.roll(path, -first, axis=0), np.roll(turning, -first)
-    steps = np.linalg.norm(np.roll(path, -1, axis=0) - path, axis=1)
-    # slow down ahead of a turn: spread the turn's spacing over about 10 m to both sides
-    width = max(1, int(10 / steps.mean()))
-    window = np.hanning(2 * width + 1)
-    padded = np.concatenate([turning[-width:], turning, turning[:width]]).astype(float)
-    slow = np.minimum(2 * np.convolve(padded, window / window.sum(), mode="valid"), 1)
-    density = 1 / (spacing + (corner_spacing - spacing) * slow)
-    passed = np.concatenate([[0], np.cumsum(steps * density)])
-    count = round(passed[-1])
-    wanted = np.arange(count) * passed[-1] / count
-    closed = np.vstack([path, path[:1]])
-    return np.stack([np.interp(wanted, passed, closed[:, axis]) for axis in range(2)], axis=1)
-
-
-def _rounded_polygon(
-    corners: NDArray[np.float64], radius: float, step: float = 0.05
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    path: list[NDArray[np.float64]] = []
-    turning: list[NDArray[np.bool_]] = []
-    for before, corner, after in zip(
-        np.roll(corners, 1, axis=0), corners, np.roll(corners, -1, axis=0), strict=True
-    ):
-        arrive, leave = _unit(corner - before), _unit(after - corner)
-        turn = np.arctan2(arrive[0] * leave[1] - arrive[1] * leave[0], arrive @ leave)
-        cut = radius * np.tan(abs(turn) / 2)
-        previous = path[-1][-1] if path else None
-        entry = corner - cut * arrive
-        if previous is not None:
-            path.append(_line(previous, entry, step))
-            turning.append(np.zeros(len(path[-1]), bool))
-        angles = np.linspace(0, turn, max(2, int(radius * abs(turn) / step)))
-        side = np.sign(turn) * np.array([-arrive[1], arrive[0]])
-        center = entry + radius * side
-        arc = center - radius * (np.cos(angles)[:, None] * side - np.sin(np.abs(angles))[:, None] * arrive)
-        path.append(arc)
-        turning.append(np.ones(len(arc), bool))
-    path.append(_line(path[-1][-1], path[0][0], step))
-    turning.append(np.zeros(len(path[-1]), bool))
-    return np.concatenate(path), np.concatenate(turning)
-
-
-def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    return vector / np.linalg.norm(vector)
-
-
-def _line(start: NDArray[np.float64], end: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-    count = max(2, int(np.linalg.norm(end - start) / step))
-    return start + np.linspace(0, 1, count, endpoint=False)[1:, None] * (end - start)

@@ -1,105 +1,119 @@
-"""Worlds as sets of analytic primitives: one pytree of arrays per kind."""
+"""Worlds as sets of analytic primitives: one pytree of arrays per kind; and the part near a sensor."""
 
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-
-class Planes(eqx.Module):
-    """Infinite planes."""
-
-    point: Float[Array, "n 3"]
-    """Any point of the plane, world frame, m."""
-    normal: Float[Array, "n 3"]
-    """Unit normal, world frame."""
-    reflectivity: Float[Array, " n"]
-    """Share of the light that comes back at normal incidence, 0 to 1."""
+from lio_jax.sim.movers import Movers, MovingBoxes, moving_boxes
+from lio_jax.sim.primitives import Boxes, Cylinders, Grounds, Planes, Spheres, TiltedBoxes
 
 
-class Boxes(eqx.Module):
-    """Upright boxes, turned about the vertical."""
+class Solids(eqx.Module):
+    """Everything at rest; what a ray meets first is what counts, so solids may overlap."""
 
-    center: Float[Array, "n 3"]
-    """World frame, m."""
-    half_size: Float[Array, "n 3"]
-    """Half the edge lengths along the box's own axes, m."""
-    yaw: Float[Array, " n"]
-    """Rotation world from box about +z, rad."""
-    reflectivity: Float[Array, " n"]
-    """Share of the light that comes back at normal incidence, 0 to 1."""
-
-
-class Cylinders(eqx.Module):
-    """Upright solid cylinders."""
-
-    base: Float[Array, "n 3"]
-    """Centre of the lower cap, world frame, m."""
-    radius: Float[Array, " n"]
-    """m."""
-    height: Float[Array, " n"]
-    """m."""
-    reflectivity: Float[Array, " n"]
-    """Share of the light that comes back at normal incidence, 0 to 1."""
+    planes: Planes
+    grounds: Grounds
+    boxes: Boxes
+    tilted: TiltedBoxes
+    cylinders: Cylinders
+    spheres: Spheres
 
 
 class World(eqx.Module):
-    """Everything a ray can hit."""
+    """Everything a ray can hit, in the world frame."""
 
-    planes: Planes
-    boxes: Boxes
-    cylinders: Cylinders
+    solids: Solids
+    movers: Movers
 
 
-_Rows = TypeVar("_Rows", Boxes, Cylinders)
+class Part(eqx.Module):
+    """What is near a position that is its origin, at an instant: what rays are cast into."""
+
+    solids: Solids
+    moving: MovingBoxes
+
+
+class Counts(NamedTuple):
+    """How many solids of each kind that is culled."""
+
+    boxes: int | Int[Array, ""]
+    tilted: int | Int[Array, ""]
+    cylinders: int | Int[Array, ""]
+    spheres: int | Int[Array, ""]
+
+
+_Rows = TypeVar("_Rows", Boxes, TiltedBoxes, Cylinders, Spheres)
 
 
 def nearest_part(
-    world: World, position: Float[Array, "3"], box_count: int, cylinder_count: int
-) -> tuple[World, Float[Array, ""]]:
-    """Return the planes, the nearest boxes and cylinders, moved so that ``position`` is the origin.
+    world: World, position: Float[Array, "3"], time: Float[Array, ""], counts: Counts
+) -> tuple[Part, Float[Array, ""]]:
+    """Return planes, grounds, movers and the nearest other solids, moved so that ``position`` is the origin.
 
-    Casting near the origin keeps float32 ranges exact; leaving far primitives out makes casting cheap.
+    Casting near the origin keeps float32 ranges exact; leaving far solids out makes casting cheap.
 
     Args:
         world: everything.
-        position: world frame, m.
-        box_count: number of boxes kept.
-        cylinder_count: number of cylinders kept.
+        position: world frame, m, in the world's dtype; rays are stated relative to this rounded value.
+        time: where the movers are placed, s from the recording's start.
+        counts: numbers of solids kept, static.
 
     Returns:
         The part, and the radius (m) around ``position`` within which nothing was left out.
     """
-    boxes, box_reach = _nearest_rows(world.boxes, _box_gap(world.boxes, position), box_count)
-    cylinders, cylinder_reach = _nearest_rows(
-        world.cylinders, _cylinder_gap(world.cylinders, position), cylinder_count
+    gaps = _gaps(world, position)
+    solids = world.solids
+    boxes, box_reach = _nearest_rows(solids.boxes, gaps[0], int(counts.boxes))
+    tilted, tilted_reach = _nearest_rows(solids.tilted, gaps[1], int(counts.tilted))
+    cylinders, cylinder_reach = _nearest_rows(solids.cylinders, gaps[2], int(counts.cylinders))
+    spheres, sphere_reach = _nearest_rows(solids.spheres, gaps[3], int(counts.spheres))
+    part = Part(
+        Solids(
+            solids.planes.moved(-position),
+            solids.grounds.moved(-position),
+            boxes.moved(-position),
+            tilted.moved(-position),
+            cylinders.moved(-position),
+            spheres.moved(-position),
+        ),
+        moving_boxes(world.movers, time).moved(-position),
     )
-    part = World(
-        eqx.tree_at(lambda planes: planes.point, world.planes, world.planes.point - position),
-        eqx.tree_at(lambda rows: rows.center, boxes, boxes.center - position),
-        eqx.tree_at(lambda rows: rows.base, cylinders, cylinders.base - position),
+    reach = jnp.min(jnp.stack([box_reach, tilted_reach, cylinder_reach, sphere_reach]))
+    return part, reach
+
+
+def counts_within(world: World, position: Float[Array, "3"], radius: float | Float[Array, ""]) -> Counts:
+    """Count the solids of each culled kind that reach into the horizontal circle of ``radius`` m."""
+    return Counts(*(jnp.sum(gap < radius) for gap in _gaps(world, position)))
+
+
+def counts_along(world: World, positions: Float[Array, "n 3"], radius: float) -> Counts:
+    """Return the largest count of each kind within ``radius`` m of any position, as plain integers."""
+    counts = _counts_along(world, positions, jnp.asarray(radius, positions.dtype))
+    return Counts(*(int(count.max()) for count in counts))
+
+
+@jax.jit
+def _counts_along(world: World, positions: Float[Array, "n 3"], radius: Float[Array, ""]) -> Counts:
+    return jax.vmap(lambda position: counts_within(world, position, radius))(positions)
+
+
+def _gaps(world: World, position: Float[Array, "3"]) -> tuple[Float[Array, " n"], ...]:
+    """Return each culled kind's horizontal distances from ``position``, never more than the true ones."""
+    solids = world.solids
+
+    def level(centers: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        return jnp.linalg.norm(centers[:, :2] - position[:2], axis=1)
+
+    return (
+        level(solids.boxes.center) - jnp.linalg.norm(solids.boxes.half_size[:, :2], axis=1),
+        level(solids.tilted.center) - jnp.linalg.norm(solids.tilted.half_size, axis=1),
+        level(solids.cylinders.base) - solids.cylinders.radius,
+        level(solids.spheres.center) - solids.spheres.radius,
     )
-    return part, jnp.minimum(box_reach, cylinder_reach)
-
-
-def counts_within(
-    world: World, position: Float[Array, "3"], radius: float | Float[Array, ""]
-) -> Int[Array, "2"]:
-    """Count the boxes and cylinders that reach into the horizontal circle of ``radius`` m at ``position``."""
-    boxes = jnp.sum(_box_gap(world.boxes, position) < radius)
-    cylinders = jnp.sum(_cylinder_gap(world.cylinders, position) < radius)
-    return jnp.stack([boxes, cylinders])
-
-
-def _box_gap(boxes: Boxes, position: Float[Array, "3"]) -> Float[Array, " n"]:
-    offset = jnp.linalg.norm(boxes.center[:, :2] - position[:2], axis=1)
-    return offset - jnp.linalg.norm(boxes.half_size[:, :2], axis=1)
-
-
-def _cylinder_gap(cylinders: Cylinders, position: Float[Array, "3"]) -> Float[Array, " n"]:
-    return jnp.linalg.norm(cylinders.base[:, :2] - position[:2], axis=1) - cylinders.radius
 
 
 def _nearest_rows(rows: _Rows, gap: Float[Array, " n"], count: int) -> tuple[_Rows, Float[Array, ""]]:

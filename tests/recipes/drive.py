@@ -13,9 +13,11 @@ from lio_jax.core.config import Config, LidarConfig, MapConfig
 from lio_jax.core.params import DEFAULTS, Params, params_from_values
 from lio_jax.core.types import Scan
 from lio_jax.recipes import default
-from lio_jax.recipes.default import Output, State
+from lio_jax.recipes.default import State
+from lio_jax.recipes.output import Output
+from lio_jax.sim.assembly import assembled
 from lio_jax.sim.lidar import column_times, spinning_lidar, sweep
-from lio_jax.sim.worlds import Boxes, Cylinders, Planes, World
+from lio_jax.sim.worlds import Counts, World, nearest_part
 
 PERIOD, BEAMS, COLUMNS = 0.1, 16, 256
 CONFIG = Config(
@@ -30,35 +32,20 @@ TWIST = np.array([6.0, 0.3, 0.1, 0.02, -0.03, 0.3])
 def hall() -> World:
     """Return a hall of 34 x 22 x 7 m with crates and columns, the sensor's start at the origin."""
     sides = zip(np.eye(3), (17, 11, 3.5), strict=True)
-    walls = [(sign * size * axis, -sign * axis) for axis, size in sides for sign in (-1, 1)]
-    points, normals = (np.array(part) + 0.0 for part in zip(*walls, strict=True))
-    crates = np.array(
-        [
-            [7.3, 4.1, -2.5, 1.2, 0.8, 1.0, 0.3],
-            [-6.2, -5.3, -2.0, 0.9, 1.6, 1.5, 1.1],
-            [11.0, -6.4, -2.2, 1.5, 1.1, 1.3, -0.6],
-            [-10.5, 6.2, -1.5, 1.0, 1.0, 2.0, 0.8],
-            [2.5, -8.0, -2.6, 2.0, 0.7, 0.9, 0.1],
-        ]
-    )
-    columns = np.array([[5.0, -4.0], [-5.0, 5.0], [12.0, 3.0], [-12.0, -2.0]])
-
-    def array(values) -> jax.Array:
-        return jnp.asarray(values, jnp.float32)
-
-    return World(
-        Planes(array(points), array(normals), array(np.full(6, 0.5))),
-        Boxes(array(crates[:, :3]), array(crates[:, 3:6]), array(crates[:, 6]), array(np.full(5, 0.5))),
-        Cylinders(
-            array(np.column_stack([columns, np.full(4, -3.5)])),
-            array(np.full(4, 0.3)),
-            array(np.full(4, 7.0)),
-            array(np.full(4, 0.5)),
-        ),
-    )
+    walls = [[*(sign * size * axis), *(-sign * axis), 0.5] for axis, size in sides for sign in (-1, 1)]
+    crates = [
+        [7.3, 4.1, -2.5, 1.2, 0.8, 1.0, 0.3, 0.5],
+        [-6.2, -5.3, -2.0, 0.9, 1.6, 1.5, 1.1, 0.5],
+        [11.0, -6.4, -2.2, 1.5, 1.1, 1.3, -0.6, 0.5],
+        [-10.5, 6.2, -1.5, 1.0, 1.0, 2.0, 0.8, 0.5],
+        [2.5, -8.0, -2.6, 2.0, 0.7, 0.9, 0.1, 0.5],
+    ]
+    columns = [[x, y, -3.5, 0.3, 7.0, 0.5] for x, y in ((5.0, -4.0), (-5.0, 5.0), (12.0, 3.0), (-12.0, -2.0))]
+    return assembled([0.0, 0.0, 0.0], planes=walls, boxes=crates, cylinders=columns)
 
 
 WORLD = hall()
+_PART = nearest_part(WORLD, jnp.zeros(3, jnp.float32), jnp.float32(0), Counts(5, 0, 4, 0))[0]
 
 
 def moved(twist: np.ndarray, seconds: float) -> np.ndarray:
@@ -74,7 +61,7 @@ def lidar_pose(seconds: float, twist: np.ndarray = TWIST) -> np.ndarray:
 
 @jax.jit
 def _turn(poses: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    turn = sweep(LIDAR, WORLD, jaxlie.SE3.from_matrix(poses), key)
+    turn = sweep(LIDAR, _PART, jaxlie.SE3.from_matrix(poses), key)
     return turn.points.reshape(-1, 3), turn.mask.reshape(-1)
 
 
@@ -166,9 +153,9 @@ def distance_to_hall(points: np.ndarray) -> np.ndarray:
     """Return the distance (m) of points (n, 3) in the hall's frame to its nearest surface."""
     walls = np.abs(np.abs(points) - [17, 11, 3.5]).min(1)
     found = [walls]
-    for x, y in np.asarray(WORLD.cylinders.base)[:, :2]:
+    for x, y in np.asarray(WORLD.solids.cylinders.base)[:, :2]:
         found.append(np.abs(np.hypot(points[:, 0] - x, points[:, 1] - y) - 0.3))
-    boxes = WORLD.boxes
+    boxes = WORLD.solids.boxes
     for centre, half, yaw in zip(*map(np.asarray, (boxes.center, boxes.half_size, boxes.yaw)), strict=True):
         cos, sin = np.cos(yaw), np.sin(yaw)
         local = (points - centre) @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])

@@ -1,0 +1,140 @@
+"""From the rows that builders write in double precision to a World of float32 arrays."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from numpy.typing import ArrayLike, NDArray
+
+from lio_jax.sim.movers import Movers
+from lio_jax.sim.primitives import Boxes, Cylinders, Grounds, Planes, Spheres, TiltedBoxes
+from lio_jax.sim.worlds import Solids, World
+
+Rows = NDArray[np.float64] | Sequence[Sequence[float | int]]
+"""A table, one solid a row."""
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """A sloping ground: z = sum of amplitude sin(wave . (x, y) + phase)."""
+
+    amplitude: NDArray[np.float64]
+    """(w,) m."""
+    wave: NDArray[np.float64]
+    """(w, 2) rad/m."""
+    phase: NDArray[np.float64]
+    """(w,) rad."""
+    reflectivity: float
+
+    def height(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the height (m) at (..., 2) positions (m)."""
+        return np.sum(self.amplitude * np.sin(points @ self.wave.T + self.phase), axis=-1)
+
+    def slope(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gradient (..., 2) of the height at (..., 2) positions (m)."""
+        return (self.amplitude * np.cos(points @ self.wave.T + self.phase)) @ self.wave
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """Bodies on closed paths and the boxes they are made of; see Movers."""
+
+    path: NDArray[np.float64]
+    """(m, k, 3) m."""
+    yaw: NDArray[np.float64]
+    """(m, k) rad."""
+    period: NDArray[np.float64]
+    """(m,) s."""
+    body: NDArray[np.int64]
+    """(n,)."""
+    boxes: NDArray[np.float64]
+    """(n, 8): see assembled."""
+
+
+def assembled(
+    origin: ArrayLike,
+    *,
+    planes: Rows = (),
+    terrain: Terrain | None = None,
+    boxes: Rows = (),
+    tilted: Rows = (),
+    cylinders: Rows = (),
+    spheres: Rows = (),
+    traffic: Traffic | None = None,
+) -> World:
+    """Return the world whose origin is at ``origin`` of the builder's frame.
+
+    Args:
+        origin: (3,) m.
+        planes: rows of point 3, normal 3, reflectivity.
+        terrain: the ground, if it is not a plane or boxes.
+        boxes: rows of centre 3, half size 3, yaw, reflectivity.
+        tilted: rows of centre 3, half size 3, rotation matrix row by row 9, reflectivity.
+        cylinders: rows of base centre 3, radius, height, reflectivity.
+        spheres: rows of centre 3, radius, reflectivity.
+        traffic: what moves.
+
+    Returns:
+        float32 arrays; angles in rad, lengths in m.
+    """
+    origin = np.asarray(origin, float)
+    point, *plane = _columns(planes, 3, 3, 1)
+    center, *box = _columns(boxes, 3, 3, 1, 1)
+    middle, half_size, rotation, reflectivity = _columns(tilted, 3, 3, 9, 1)
+    base, *cylinder = _columns(cylinders, 3, 1, 1, 1)
+    heart, *sphere = _columns(spheres, 3, 1, 1)
+    solids = Solids(
+        Planes(*_single([point - origin, *plane])),
+        _ground(terrain, origin),
+        Boxes(*_single([center - origin, *box])),
+        TiltedBoxes(*_single([middle - origin, half_size, rotation.reshape(-1, 3, 3), reflectivity])),
+        Cylinders(*_single([base - origin, *cylinder])),
+        Spheres(*_single([heart - origin, *sphere])),
+    )
+    return World(solids, _movers(traffic, origin))
+
+
+def upright(
+    low: ArrayLike, high: ArrayLike, reflectivity: ArrayLike, yaw: ArrayLike = 0.0
+) -> NDArray[np.float64]:
+    """Return box rows from opposite corners (..., 3) m; ``yaw`` (rad) turns each about its own centre."""
+    low, high = np.broadcast_arrays(np.atleast_2d(np.asarray(low, float)), np.atleast_2d(high))
+    rows = len(low)
+    return np.column_stack(
+        [(low + high) / 2, (high - low) / 2, np.broadcast_to(yaw, rows), np.broadcast_to(reflectivity, rows)]
+    )
+
+
+def draws(rng: np.random.Generator, rows: int, *ranges: tuple[float, float]) -> list[NDArray[np.float64]]:
+    """Return one (rows,) array of uniform draws for each range."""
+    return [rng.uniform(low, high, rows) for low, high in ranges]
+
+
+def _columns(rows: Rows, *widths: int) -> list[NDArray[np.float64]]:
+    table = np.reshape(np.asarray(rows, float), (-1, sum(widths)))
+    parts = np.split(table, np.cumsum(widths)[:-1], axis=1)
+    return [part[:, 0] if width == 1 else part for part, width in zip(parts, widths, strict=True)]
+
+
+def _single(parts: Sequence[NDArray[np.float64]]) -> list[Array]:
+    return [jnp.asarray(part, jnp.float32) for part in parts]
+
+
+def _ground(terrain: Terrain | None, origin: NDArray[np.float64]) -> Grounds:
+    if terrain is None:
+        return Grounds(*(jnp.zeros(shape, jnp.float32) for shape in ((0,), (0, 1), (0, 1, 2), (0, 1), (0,))))
+    phase = np.mod(terrain.phase + terrain.wave @ origin[:2], 2 * np.pi)
+    parts = (-origin[2], terrain.amplitude, terrain.wave, phase, terrain.reflectivity)
+    return Grounds(*_single([np.asarray(part)[None] for part in parts]))
+
+
+def _movers(traffic: Traffic | None, origin: NDArray[np.float64]) -> Movers:
+    if traffic is None:
+        traffic = Traffic(
+            np.zeros((1, 1, 3)), np.zeros((1, 1)), np.ones(1), np.zeros(0, np.int64), np.zeros((0, 8))
+        )
+    path, yaw, period = _single([traffic.path - origin, traffic.yaw, traffic.period])
+    boxes = Boxes(*_single(_columns(traffic.boxes, 3, 3, 1, 1)))
+    return Movers(path, yaw, period, jnp.asarray(traffic.body, jnp.int32), boxes)

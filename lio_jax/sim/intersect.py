@@ -1,0 +1,188 @@
+"""Where rays meet one primitive: the distance along each ray, inf on a miss.
+
+Each function takes one row of a kind of primitive and all rays, one array per coordinate.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+TINY = 1e-12
+"""Stands in for a zero direction component: 1/TINY stays finite in float32."""
+
+_GROUND_STEPS = 20
+"""At 16, one ray in 15,000 over the worlds' grounds was not yet down at 130 m; at 20, none."""
+
+_GROUND_END = 300.0
+"""Beyond this distance no ray meets a ground, m."""
+
+
+class Rays(NamedTuple):
+    """Origins and unit directions, one array per coordinate: the layout that vectorises."""
+
+    x: Float[Array, " n"]
+    y: Float[Array, " n"]
+    z: Float[Array, " n"]
+    dx: Float[Array, " n"]
+    dy: Float[Array, " n"]
+    dz: Float[Array, " n"]
+    time: Float[Array, " n"]
+    """s since the instant at which the movers were placed."""
+
+
+def plane_distance(plane: Any, rays: Rays) -> Float[Array, " n"]:
+    """Return the distance to one plane (a row of Planes)."""
+    point, normal = plane.point, plane.normal
+    closing = rays.dx * normal[0] + rays.dy * normal[1] + rays.dz * normal[2]
+    gap = (point[0] - rays.x) * normal[0] + (point[1] - rays.y) * normal[1] + (point[2] - rays.z) * normal[2]
+    distance = gap / _away_from_zero(closing)
+    return jnp.where((distance > 0) & (jnp.abs(closing) > TINY), distance, jnp.inf)
+
+
+def ground_distance(ground: Any, rays: Rays) -> Float[Array, " n"]:
+    """Return the distance to one height field (a row of Grounds).
+
+    With F the ray's height above ground and c >= |F''| along it, nothing is met before
+    F + F' s - c s^2 / 2 falls to zero: steps of that s never jump over the first crossing and converge to it
+    quadratically. A ray that only grazes the ground may run out of steps and counts as a miss.
+    """
+    waves = [
+        (
+            amplitude,
+            wave[0] * rays.x + wave[1] * rays.y + phase,
+            wave[0] * rays.dx + wave[1] * rays.dy,
+        )
+        for amplitude, wave, phase in zip(ground.amplitude, ground.wave, ground.phase, strict=True)
+    ]
+    bend = sum((amplitude * slope**2 for amplitude, _, slope in waves), jnp.zeros_like(rays.x))
+
+    def above(distance: Array) -> tuple[Array, Array]:
+        gap, rate = rays.z + distance * rays.dz - ground.height, rays.dz
+        for amplitude, start, slope in waves:
+            sin, cos = _sin_cos(start + slope * distance)
+            gap, rate = gap - amplitude * sin, rate - amplitude * slope * cos
+        return gap, rate
+
+    begin = jnp.zeros_like(rays.x)
+    side = jnp.where(above(begin)[0] < 0, -1.0, 1.0).astype(begin.dtype)
+
+    def advance(_: Array, distance: Array) -> Array:
+        gap, rate = above(distance)
+        gap, rate = jnp.maximum(side * gap, 0), side * rate
+        root = jnp.sqrt(rate**2 + 2 * bend * gap)
+        falling = 2 * gap / jnp.maximum(root - rate, TINY)
+        rising = (rate + root) / jnp.maximum(bend, TINY)
+        return jnp.minimum(distance + jnp.where(rate < 0, falling, rising), _GROUND_END)
+
+    distance = jax.lax.fori_loop(0, _GROUND_STEPS, advance, begin)
+    # what a coordinate of that size is rounded to, some ten times over
+    tolerance = 10 * jnp.finfo(begin.dtype).eps * (10 + distance)
+    reached = (jnp.abs(above(distance)[0]) < tolerance) & (distance > 0) & (distance < _GROUND_END)
+    return jnp.where(reached, distance, jnp.inf)
+
+
+def box_distance(box: Any, rays: Rays) -> Float[Array, " n"]:
+    """Return the distance to one upright box (a row of Boxes); slab method."""
+    cos, sin = jnp.cos(box.yaw), jnp.sin(box.yaw)
+    east, north = rays.x - box.center[0], rays.y - box.center[1]
+    slabs = (
+        _slab(cos * east + sin * north, cos * rays.dx + sin * rays.dy, box.half_size[0]),
+        _slab(cos * north - sin * east, cos * rays.dy - sin * rays.dx, box.half_size[1]),
+        _slab(rays.z - box.center[2], rays.dz, box.half_size[2]),
+    )
+    return _first_of_interval(*slabs)
+
+
+def tilted_distance(box: Any, rays: Rays) -> Float[Array, " n"]:
+    """Return the distance to one box in any attitude (a row of TiltedBoxes); slab method."""
+    east, north, up = rays.x - box.center[0], rays.y - box.center[1], rays.z - box.center[2]
+    slabs = (
+        _slab(
+            axis[0] * east + axis[1] * north + axis[2] * up,
+            axis[0] * rays.dx + axis[1] * rays.dy + axis[2] * rays.dz,
+            box.half_size[number],
+        )
+        for number, axis in enumerate(box.rotation.T)
+    )
+    return _first_of_interval(*slabs)
+
+
+def moving_distance(moving: Any, rays: Rays) -> Float[Array, " n"]:
+    """Return the distance to one moving box (a row of MovingBoxes) where it is when each ray is sent."""
+    return box_distance(
+        moving.boxes,
+        rays._replace(
+            x=rays.x - moving.velocity[0] * rays.time,
+            y=rays.y - moving.velocity[1] * rays.time,
+            z=rays.z - moving.velocity[2] * rays.time,
+        ),
+    )
+
+
+def cylinder_distance(cylinder: Any, rays: Rays) -> Float[Array, " n"]:
+    """Return the distance to one solid cylinder (a row of Cylinders).
+
+    The discriminant comes from the ray's closest approach to the axis, a r^2 - cross^2: the textbook
+    b^2 - ac loses thin poles to cancellation in float32.
+    """
+    east, north = rays.x - cylinder.base[0], rays.y - cylinder.base[1]
+    level = rays.dx**2 + rays.dy**2
+    a = jnp.maximum(level, TINY)
+    b = east * rays.dx + north * rays.dy
+    cross = east * rays.dy - north * rays.dx
+    discriminant = a * cylinder.radius**2 - cross**2
+    root = jnp.sqrt(jnp.maximum(discriminant, 0))
+    missed = jnp.where(level < TINY, east**2 + north**2 > cylinder.radius**2, discriminant < 0)
+    wall = (jnp.where(missed, jnp.inf, (-b - root) / a), jnp.where(missed, -jnp.inf, (-b + root) / a))
+    half = cylinder.height / 2
+    return _first_of_interval(wall, _slab(rays.z - cylinder.base[2] - half, rays.dz, half))
+
+
+def sphere_distance(sphere: Any, rays: Rays) -> Float[Array, " n"]:
+    """Return the distance to one ball (a row of Spheres); the discriminant from the closest approach."""
+    x, y, z = sphere.center[0] - rays.x, sphere.center[1] - rays.y, sphere.center[2] - rays.z
+    along = x * rays.dx + y * rays.dy + z * rays.dz
+    aside = (x - along * rays.dx) ** 2 + (y - along * rays.dy) ** 2 + (z - along * rays.dz) ** 2
+    discriminant = sphere.radius**2 - aside
+    root = jnp.sqrt(jnp.maximum(discriminant, 0))
+    distance = jnp.where(along > root, along - root, along + root)
+    return jnp.where((discriminant >= 0) & (distance > 0), distance, jnp.inf)
+
+
+def _away_from_zero(value: Float[Array, " n"]) -> Float[Array, " n"]:
+    return jnp.where(jnp.abs(value) < TINY, TINY, value)
+
+
+def _sin_cos(angle: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Return both, to 2e-14 for angles of some tens of radians: on a CPU ten times as fast as jnp.sin."""
+    quarter = jnp.round(angle * (2 / jnp.pi))
+    # pi/2 in three parts (Cody and Waite): small multiples of the first two are exact in float32
+    rest = ((angle - quarter * 1.5703125) - quarter * 4.8351287841796875e-4) - quarter * 3.139164786504813e-7
+    square = rest**2
+    sin, cos = jnp.ones_like(square), jnp.ones_like(square)
+    for power in range(14, 0, -2):
+        sin = 1 - square * sin / (power * (power + 1))
+        cos = 1 - square * cos / (power * (power - 1))
+    sin = rest * sin
+    turn = quarter - 4 * jnp.floor(quarter / 4)
+    odd = (turn == 1) | (turn == 3)
+    sin, cos = jnp.where(odd, cos, sin), jnp.where(odd, sin, cos)
+    return jnp.where(turn >= 2, -sin, sin), jnp.where((turn == 1) | (turn == 2), -cos, cos)
+
+
+def _slab(
+    offset: Float[Array, " n"], direction: Float[Array, " n"], half: Float[Array, ""]
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    inverse = 1 / _away_from_zero(direction)
+    middle, reach = -offset * inverse, half * jnp.abs(inverse)
+    return middle - reach, middle + reach
+
+
+def _first_of_interval(*intervals: tuple[Float[Array, " n"], Float[Array, " n"]]) -> Float[Array, " n"]:
+    enter, leave = intervals[0]
+    for start, end in intervals[1:]:
+        enter, leave = jnp.maximum(enter, start), jnp.minimum(leave, end)
+    distance = jnp.where(enter > 0, enter, leave)
+    return jnp.where((enter <= leave) & (distance > 0), distance, jnp.inf)

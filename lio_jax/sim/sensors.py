@@ -1,0 +1,141 @@
+"""The sensors that can be simulated, by name, with the geometry of their data sheets."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.errors import UsageError
+from lio_jax.sim.lidar import Lidar, Ranging, SpinningLidar, ranging, spinning_lidar
+from lio_jax.sim.livox_pattern import RosetteLidar
+
+Layout = Literal["velodyne", "ouster", "livox"]
+"""Whose driver's message a bag holds the scans in."""
+
+_TURN_NS = 100_000_000
+"""All sensors sweep at 10 Hz."""
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor that can be asked for by name."""
+
+    build: Callable[[], Lidar]
+    layout: Layout
+    description: str
+
+
+def vlp16() -> SpinningLidar:
+    """Return a VLP-16: 2 deg apart, fired 2.304 us apart in interleaved order, rings from the lowest."""
+    upper, lower = np.arange(1.0, 16.0, 2.0), np.arange(-15.0, 0.0, 2.0)
+    elevation = np.stack([lower, upper], axis=1).ravel()
+    return _spinning(elevation, 1800, 2304 * np.arange(16), ranging(0.02, 0.5, 100.0, 250.0))
+
+
+def hdl32() -> SpinningLidar:
+    """Return an HDL-32E: 4/3 deg apart, fired 1.152 us apart in interleaved order, rings from the lowest."""
+    ascending = (np.arange(32) * 4 - 92) / 3
+    elevation = np.stack([ascending[:16], ascending[16:]], axis=1).ravel()
+    return _spinning(elevation, 2170, 1152 * np.arange(32), ranging(0.02, 1.0, 100.0, 250.0))
+
+
+def hdl64() -> SpinningLidar:
+    """Return an HDL-64E: 1/3 deg apart above, 1/2 deg below, one beam of each block at a time.
+
+    Rings count from the highest beam, as in KITTI and A-LOAM.
+    """
+    upper, lower = 2.0 - np.arange(32) / 3, -8.83 - np.arange(32) / 2
+    elevation = np.stack([upper, lower], axis=1).ravel()
+    return _spinning(
+        elevation, 2083, 1480 * (np.arange(64) // 2), ranging(0.02, 0.9, 120.0, 300.0), top_down=True
+    )
+
+
+def os1_64() -> SpinningLidar:
+    """Return an OS1-64: 45 deg of view, beams staggered in azimuth and fired at once, rings from the top."""
+    return _ouster(64)
+
+
+def os1_128() -> SpinningLidar:
+    """Return an OS1-128: as the OS1-64, with twice the beams."""
+    return _ouster(128)
+
+
+def livox() -> RosetteLidar:
+    """Return an Avia-like sensor: 70.4 x 77.2 deg, six lines, 240,000 rays a second, never the same sweep.
+
+    The prisms' rates are a choice of this package (Livox does not publish them): 100 s without repetition.
+    """
+    lines = 6
+    fan = np.deg2rad(np.linspace(-3.4, 3.4, lines))
+    return RosetteLidar(
+        ranging=ranging(0.02, 1.0, 200.0, 600.0),
+        columns=4000,
+        period_ns=_TURN_NS,
+        delay_ns=tuple(25_000 * line // lines for line in range(lines)),
+        ring=tuple(range(lines)),
+        prism_mhz=(121_570, -77_730),
+        radius=jnp.float32(np.deg2rad(35.2)),
+        fan=jnp.asarray(fan, jnp.float32),
+    )
+
+
+SENSORS: dict[str, Sensor] = {
+    "generic32": Sensor(spinning_lidar, "velodyne", "ideal, 32 beams x 1024 columns"),
+    "vlp16": Sensor(vlp16, "velodyne", "Velodyne VLP-16"),
+    "hdl32": Sensor(hdl32, "velodyne", "Velodyne HDL-32E"),
+    "hdl64": Sensor(hdl64, "velodyne", "Velodyne HDL-64E"),
+    "os1_64": Sensor(os1_64, "ouster", "Ouster OS1-64"),
+    "os1_128": Sensor(os1_128, "ouster", "Ouster OS1-128"),
+    "livox": Sensor(livox, "livox", "Livox Avia"),
+}
+
+
+def find_sensor(name: str) -> Sensor:
+    """Return a sensor by its name.
+
+    Raises:
+        UsageError: there is none of that name.
+    """
+    if name not in SENSORS:
+        raise UsageError(f"sensor '{name}' is unknown; choose one of: {', '.join(SENSORS)}.")
+    return SENSORS[name]
+
+
+def _ouster(beams: int) -> SpinningLidar:
+    elevation = np.linspace(22.5, -22.5, beams)
+    stagger = np.tile([3.16, 1.05, -1.05, -3.16], beams // 4)
+    return _spinning(
+        elevation,
+        1024,
+        np.zeros(beams, np.int64),
+        ranging(0.015, 0.5, 120.0, 400.0),
+        azimuth=stagger,
+        top_down=True,
+    )
+
+
+def _spinning(
+    elevation: NDArray[np.float64],
+    columns: int,
+    delay_ns: NDArray[np.int64],
+    model: Ranging,
+    azimuth: NDArray[np.float64] | None = None,
+    top_down: bool = False,
+) -> SpinningLidar:
+    """Number the beams by elevation; angles in deg, in firing order."""
+    ascending = np.argsort(np.argsort(elevation))
+    ring = len(elevation) - 1 - ascending if top_down else ascending
+    offset = np.zeros(len(elevation)) if azimuth is None else azimuth
+    return SpinningLidar(
+        ranging=model,
+        columns=columns,
+        period_ns=_TURN_NS,
+        delay_ns=tuple(int(delay) for delay in delay_ns),
+        ring=tuple(int(number) for number in ring),
+        elevation=jnp.asarray(np.deg2rad(elevation), jnp.float32),
+        azimuth=jnp.asarray(np.deg2rad(offset), jnp.float32),
+    )

@@ -1,0 +1,35 @@
+"""The worlds by name."""
+
+from collections.abc import Callable
+
+from lio_jax.core.errors import UsageError
+from lio_jax.sim.city import city
+from lio_jax.sim.field import field
+from lio_jax.sim.office import office
+from lio_jax.sim.room import room
+from lio_jax.sim.scene import Scene
+from lio_jax.sim.stairs import stairs
+from lio_jax.sim.street import street
+from lio_jax.sim.tunnel import tunnel
+
+WORLDS: dict[str, Callable[[int], Scene]] = {
+    "city": city,
+    "field": field,
+    "office": office,
+    "room": room,
+    "stairs": stairs,
+    "street": street,
+    "tunnel": tunnel,
+}
+"""Name to builder: ``builder(seed) -> Scene``."""
+
+
+def build(name: str, seed: int) -> Scene:
+    """Return the world ``name`` (see WORLDS) grown from ``seed``, with its route.
+
+    Raises:
+        UsageError: there is no such world.
+    """
+    if name not in WORLDS:
+        raise UsageError(f"world '{name}' is unknown; choose one of: {', '.join(sorted(WORLDS))}.")
+    return WORLDS[name](seed)
