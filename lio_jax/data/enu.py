@@ -34,8 +34,36 @@ def geodetic_to_enu(geodetic: NDArray[np.float64], origin: tuple[float, float, f
         geodetic: (n, 3) latitude deg, longitude deg, height m.
         origin: latitude deg, longitude deg, height m of the frame's origin.
     """
+    offset = geodetic_to_ecef(geodetic) - geodetic_to_ecef(np.array([origin]))
+    return offset @ _axes(origin)
+
+
+def enu_to_geodetic(position: NDArray[np.float64], origin: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Return (n, 3) latitude deg, longitude deg, height m of local positions.
+
+    The inverse of :func:`geodetic_to_enu`, away from the poles; latitude by fixed-point iteration, which
+    gains more than two digits a round.
+
+    Args:
+        position: (n, 3) east, north, up in m from ``origin``.
+        origin: latitude deg, longitude deg, height m of the frame's origin.
+    """
+    x, y, z = (geodetic_to_ecef(np.array([origin])) + position @ _axes(origin).T).T
+    level = np.hypot(x, y)
+    latitude = np.arctan2(z, level * (1.0 - _ECCENTRICITY_SQUARED))
+    for _ in range(8):
+        sine = np.sin(latitude)
+        prime_vertical = _SEMI_MAJOR / np.sqrt(1.0 - _ECCENTRICITY_SQUARED * sine**2)
+        latitude = np.arctan2(z + _ECCENTRICITY_SQUARED * prime_vertical * sine, level)
+    height = level / np.cos(latitude) - _SEMI_MAJOR / np.sqrt(
+        1.0 - _ECCENTRICITY_SQUARED * np.sin(latitude) ** 2
+    )
+    return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), height], axis=1)
+
+
+def _axes(origin: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Return east, north and up at ``origin`` as the columns of a matrix, earth-centred."""
     latitude, longitude = np.radians(origin[:2])
     east = [-np.sin(longitude), np.cos(longitude), 0.0]
     up = [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
-    offset = geodetic_to_ecef(geodetic) - geodetic_to_ecef(np.array([origin]))
-    return offset @ np.stack([east, np.cross(up, east), up], axis=1)
+    return np.stack([east, np.cross(up, east), up], axis=1)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data.order import StampOrder
+from lio_jax.data.order import Stamped, ascending, in_time_order
 from lio_jax.data.reconstruct import KITTI_START_AZIMUTH, azimuth_time
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
 from lio_jax.data.trajectory import Trajectory, read_kitti_poses, seconds_to_ns
@@ -91,9 +91,10 @@ class KittiSequence:
         if self._poses_path is None or self._T_cam_lidar is None:
             return None
         poses = read_kitti_poses(self._poses_path)
-        count = min(len(poses), len(self._stamps))
-        lidar = poses[:count] @ self._T_cam_lidar
-        return Trajectory(np.array(self._stamps[:count], np.int64), np.linalg.inv(lidar[0]) @ lidar)
+        # a pose whose time is wrong is none
+        kept = ascending(self._stamps[: len(poses)])
+        lidar = poses[kept] @ self._T_cam_lidar
+        return Trajectory(np.array(self._stamps, np.int64)[kept], np.linalg.inv(lidar[0]) @ lidar)
 
     def _scan(self, stamp_ns: int, rows: NDArray[np.float32]) -> LidarScan:
         points = np.ascontiguousarray(rows[:, :3])
@@ -137,12 +138,12 @@ class KittiSequence:
                 f"{self._path / 'times.txt'}: ends before scan(s) {listed(untimed, 6)}; they were skipped."
             )
         check_sizes(files.values(), self._log.add)
-        order = StampOrder(self._log.add)
-        return [
-            (number, path)
+        timed = (
+            Stamped(self._stamps[number], str(path), (number, path))
             for number, path in files.items()
-            if number < len(self._stamps) and order.accept(self._stamps[number], str(path))
-        ]
+            if number < len(self._stamps)
+        )
+        return list(in_time_order(timed, self._log.add))
 
     def _note_points(self) -> None:
         if self._compensated:

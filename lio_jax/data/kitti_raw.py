@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data.order import StampOrder
+from lio_jax.data.order import Stamped, in_time_order
 from lio_jax.data.oxts import OxtsPackets, read_oxts, read_timestamps
 from lio_jax.data.reconstruct import KITTI_START_AZIMUTH, azimuth_time
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
@@ -129,11 +129,13 @@ class KittiRawSequence:
                 f"{velodyne}: the timestamps end before scan(s) {listed(untimed, 10)}; they were skipped."
             )
         check_sizes(files.values(), self._log.add)
-        order = StampOrder(self._log.add)
+        timed = (
+            Stamped(int(starts[number]), str(path), (number, path))
+            for number, path in files.items()
+            if number < len(starts)
+        )
         sweeps = []
-        for number, path in files.items():
-            if number >= len(starts) or not order.accept(int(starts[number]), str(path)):
-                continue
+        for number, path in in_time_order(timed, self._log.add):
             duration = float(durations[number])
             if not 0.0 < duration < _LONGEST_SWEEP_S:
                 self._log.add(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data.order import StampOrder
+from lio_jax.data.order import Stamped, in_time_order
 from lio_jax.data.returns import valid_returns
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
 from lio_jax.data.trajectory import Trajectory, read_tum
@@ -70,11 +70,9 @@ class NativeSequence:
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
         """Yield scans by their numbers; unreadable and out-of-order ones are left out and reported."""
         stop = None if count is None else start + count
-        order = StampOrder(self._log.add)
-        for path in self._files[start:stop]:
-            scan = self._load_scan(path)
-            if scan is not None and order.accept(scan.stamp_ns, str(path)):
-                yield scan
+        read = ((path, self._load_scan(path)) for path in self._files[start:stop])
+        stamped = (Stamped(scan.stamp_ns, str(path), scan) for path, scan in read if scan is not None)
+        yield from in_time_order(stamped, self._log.add)
 
     def imu(self) -> ImuData | None:
         """Return imu.npz, or None where there is none."""

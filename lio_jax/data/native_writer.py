@@ -1,8 +1,5 @@
 """Write recordings in the package's own format, whole or not at all."""
 
-import os
-import secrets
-import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +12,7 @@ from lio_jax.core.errors import LioJaxError
 from lio_jax.data.native import FORMAT_VERSION
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan
 from lio_jax.data.trajectory import Trajectory, write_tum
+from lio_jax.data.whole_output import written_whole
 
 
 def write_native(
@@ -45,13 +43,11 @@ def write_native(
         overwrite: replace an existing native folder.
 
     Raises:
-        LioJaxError: ``path`` exists and may not be replaced, or there are no scans.
+        UsageError: ``path`` exists and may not be replaced.
+        LioJaxError: there are no scans, or the disk takes no more.
     """
     path = Path(path)
-    _check_free(path, overwrite)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    try:
+    with written_whole(path, overwrite, "meta.yaml") as aside:
         (aside / "scans").mkdir(parents=True)
         count = 0
         for count, scan in enumerate(scans, 1):
@@ -71,31 +67,7 @@ def write_native(
             "T_imu_lidar": None if T_imu_lidar is None else np.asarray(T_imu_lidar, float).tolist(),
         }
         (aside / "meta.yaml").write_text(yaml.safe_dump(meta, sort_keys=False))
-        _put_in_place(aside, path)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
     return count
-
-
-def _check_free(path: Path, overwrite: bool) -> None:
-    if not path.exists():
-        return
-    if not overwrite:
-        raise LioJaxError(f"{path}: exists already; choose another path or allow overwriting.")
-    if not (path / "meta.yaml").is_file():
-        raise LioJaxError(
-            f"{path}: is not a native recording, so it is not overwritten; choose another path."
-        )
-
-
-def _put_in_place(aside: Path, path: Path) -> None:
-    if not path.exists():
-        os.replace(aside, path)
-        return
-    old = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    os.replace(path, old)
-    os.replace(aside, path)
-    shutil.rmtree(old)
 
 
 def _write_scan(path: Path, scan: LidarScan) -> None:

@@ -1,48 +1,112 @@
-"""Keep scans in time order: a map must never be fed the past twice."""
+"""Keep scans in time order: a map must never be fed the past twice, nor one wrong stamp end a recording."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
+from typing import Any, Generic, NamedTuple, TypeVar
 
-from lio_jax.data.sequence import LidarScan
 from lio_jax.data.trajectory import ns_to_seconds
 
+T = TypeVar("T")
 
-class StampOrder:
-    """Accept names whose stamps ascend strictly; report duplicates and steps back in time."""
-
-    def __init__(self, warn: Callable[[str], None]) -> None:
-        self._warn = warn
-        self._latest: tuple[int, str] | None = None
-
-    def accept(self, stamp_ns: int, name: str) -> bool:
-        """Return whether ``stamp_ns`` is later than all before; else say why ``name`` is left out."""
-        if self._latest is not None and stamp_ns <= self._latest[0]:
-            latest_ns, latest_name = self._latest
-            stamp = ns_to_seconds(stamp_ns)
-            if stamp_ns == latest_ns:
-                self._warn(
-                    f"{name} has the same stamp as {latest_name} ({stamp} s): the duplicate was dropped."
-                )
-            else:
-                back = (latest_ns - stamp_ns) * 1e-9
-                self._warn(
-                    f"{name} ({stamp} s) is {back:.3f} s older than {latest_name}: out of order, skipped."
-                )
-            return False
-        self._latest = (stamp_ns, name)
-        return True
+_LEAP_NS = 1_000_000_000
+_LEAP_STEPS = 3
+"""A step ahead longer than this, or than so many of the last step, waits for what follows: is it a gap in the
+recording, or a wrong stamp?"""
+_FIRST_LEAP_NS = 300_000_000
+"""The same while no step is known: so many steps at the 10 Hz at which most lidars turn."""
+_LONGEST_GAP_NS = 3600 * 1_000_000_000
+"""At a recording's ends, where nothing lies on the other side to tell, a longer step is a wrong stamp."""
 
 
-def in_time_order(
-    scans: Iterator[LidarScan], warn: Callable[[str], None], first: int = 0
-) -> Iterator[LidarScan]:
-    """Yield the scans whose stamps ascend strictly; leave out and report the others.
+class Stamped(NamedTuple, Generic[T]):
+    """Something with a time."""
+
+    stamp_ns: int
+    name: str
+    """How a warning calls it."""
+    item: T
+
+
+def in_time_order(recorded: Iterable[Stamped[T]], warn: Callable[[str], None]) -> Iterator[T]:
+    """Yield the items whose stamps ascend strictly.
+
+    Left out and reported, one sentence each: duplicates, steps back in time, and single stamps far ahead of
+    those that follow.
 
     Args:
-        scans: in recorded order.
-        warn: called with one sentence for each scan that is left out.
-        first: number by which the first of ``scans`` is named.
+        recorded: in recorded order; read up to three ahead.
+        warn: called with each sentence.
     """
-    order = StampOrder(warn)
-    for number, scan in enumerate(scans, first):
-        if order.accept(scan.stamp_ns, f"scan {number}"):
-            yield scan
+    latest: Stamped[None] | None = None
+    waiting: Stamped[T] | None = None
+    leap_ns = _FIRST_LEAP_NS
+    for current in _without_a_wrong_start(iter(recorded), warn):
+        if waiting is not None and current.stamp_ns > waiting.stamp_ns:
+            yield waiting.item
+            leap_ns = _leap(waiting, latest)
+            latest, waiting = Stamped(waiting.stamp_ns, waiting.name, None), None
+        ahead = waiting if waiting is not None and current.stamp_ns == waiting.stamp_ns else latest
+        if ahead is not None and current.stamp_ns <= ahead.stamp_ns:
+            warn(_late(current, ahead))
+            continue
+        if waiting is not None:
+            warn(_wrong(waiting, current))
+            waiting = None
+        if latest is not None and current.stamp_ns - latest.stamp_ns > leap_ns:
+            waiting = current
+            continue
+        yield current.item
+        leap_ns = _leap(current, latest)
+        # without its item, which is as large as a scan
+        latest = Stamped(current.stamp_ns, current.name, None)
+    if waiting is not None and latest is not None:
+        if waiting.stamp_ns - latest.stamp_ns > _LONGEST_GAP_NS:
+            warn(_wrong(waiting, latest))
+        else:
+            yield waiting.item
+
+
+def ascending(stamps_ns: Sequence[int]) -> list[int]:
+    """Return the places of the stamps that :func:`in_time_order` keeps."""
+    numbered = (Stamped(stamp, "", place) for place, stamp in enumerate(stamps_ns))
+    return list(in_time_order(numbered, lambda sentence: None))
+
+
+def _leap(current: Stamped[Any], latest: Stamped[Any] | None) -> int:
+    """Return the longest step, ns, that is believed after the one from ``latest`` to ``current``."""
+    if latest is None:
+        return _FIRST_LEAP_NS
+    return min(_LEAP_NS, _LEAP_STEPS * (current.stamp_ns - latest.stamp_ns))
+
+
+def _without_a_wrong_start(
+    recorded: Iterator[Stamped[T]], warn: Callable[[str], None]
+) -> Iterator[Stamped[T]]:
+    """Leave out a first item on whose stamp the next two agree that it is wrong."""
+    head = list(islice(recorded, 3))
+    if len(head) == 3:
+        first, second, third = (entry.stamp_ns for entry in head)
+        too_late = second < third < first
+        too_early = second - first > _LONGEST_GAP_NS and 0 < third - second <= _LEAP_NS
+        if too_late or too_early:
+            warn(_wrong(head[0], head[1]))
+            del head[0]
+    while head:
+        yield head.pop(0)
+    yield from recorded
+
+
+def _late(current: Stamped[Any], ahead: Stamped[Any]) -> str:
+    stamp, back = ns_to_seconds(current.stamp_ns), (ahead.stamp_ns - current.stamp_ns) * 1e-9
+    if back == 0:
+        return f"{current.name} has the same stamp as {ahead.name} ({stamp} s): the duplicate was dropped."
+    return f"{current.name} ({stamp} s) is {back:.3f} s older than {ahead.name}: out of order, skipped."
+
+
+def _wrong(wrong: Stamped[Any], other: Stamped[Any]) -> str:
+    away = (wrong.stamp_ns - other.stamp_ns) * 1e-9
+    return (
+        f"{wrong.name} ({ns_to_seconds(wrong.stamp_ns)} s) is {abs(away):.3f} s "
+        f"{'ahead of' if away > 0 else 'behind'} {other.name} and fits none of its neighbours: "
+        "a wrong stamp, skipped."
+    )

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data.enu import geodetic_to_enu
 from lio_jax.data.geodesy import mercator_positions
+from lio_jax.data.order import ascending
 from lio_jax.data.sequence import GpsData, ImuData
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.data.velodyne_file import numbered_files
@@ -93,24 +94,22 @@ def read_oxts(folder: Path, warn: Callable[[str], None]) -> OxtsPackets | None:
     stamps: list[int] = []
     rows: list[NDArray[np.float64]] = []
     broken: list[str] = []
-    backwards = 0
     for number, path in files.items():
         row = _packet(path) if number < len(all_stamps) else None
         if row is None:
             broken.append(path.name)
-        elif stamps and all_stamps[number] <= stamps[-1]:
-            backwards += 1
         else:
             stamps.append(int(all_stamps[number]))
             rows.append(row)
+    kept = ascending(stamps)
     if broken:
         names = ", ".join(broken[:5]) + (", ..." if len(broken) > 5 else "")
         warn(
             f"{folder / 'data'}: {len(broken)} packet(s) unreadable or without timestamp, left out: {names}."
         )
-    if backwards:
-        warn(f"{folder / 'timestamps.txt'}: {backwards} packet(s) whose stamp does not ascend were left out.")
-    return OxtsPackets(np.array(stamps, np.int64), np.array(rows)) if rows else None
+    if left_out := len(stamps) - len(kept):
+        warn(f"{folder / 'timestamps.txt'}: {left_out} packet(s) whose stamp does not ascend were left out.")
+    return OxtsPackets(np.array(stamps, np.int64)[kept], np.array(rows)[kept]) if rows else None
 
 
 def _packet(path: Path) -> NDArray[np.float64] | None:

@@ -13,7 +13,7 @@ from lio_jax.data.bag_topics import Topic, bag_topics, choose_topic, listed
 from lio_jax.data.gps_messages import GpsCollector
 from lio_jax.data.imu_messages import ImuCollector
 from lio_jax.data.imu_units import accel_scale
-from lio_jax.data.order import StampOrder
+from lio_jax.data.order import Stamped, in_time_order
 from lio_jax.data.ros_header import read_header
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
 from lio_jax.data.trajectory import Trajectory
@@ -75,9 +75,11 @@ class RosbagSequence:
         """Yield scans ``start`` to ``start + count`` by their place in the bag; an empty one has n = 0.
 
         Where the bag turns out to be damaged the iteration ends with a warning; a single message that cannot
-        be decoded, a duplicate and a step back in time are left out with a warning.
+        be decoded, a duplicate, a step back in time and a wrong stamp are left out with a warning.
         """
-        order = StampOrder(self._warnings.add)
+        yield from in_time_order(self._decoded(start, count), self._warnings.add)
+
+    def _decoded(self, start: int, count: int | None) -> Iterator[Stamped[LidarScan]]:
         with open_bag(self._paths) as reader:
             for number, raw in self._lidar_messages(reader):
                 if count is not None and number >= start + count:
@@ -91,8 +93,7 @@ class RosbagSequence:
                     self._warnings.add(f"{name} cannot be read and was skipped: {error}.")
                     continue
                 scan = self._reading.scan(cloud, name, self._warnings.add)
-                if order.accept(scan.stamp_ns, name):
-                    yield scan
+                yield Stamped(scan.stamp_ns, name, scan)
 
     def header_stamps(self) -> Iterator[int]:
         """Yield the header stamp in ns of every cloud without decoding any."""

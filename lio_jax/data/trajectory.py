@@ -93,9 +93,12 @@ def read_tum(path: Path) -> Trajectory:
                 raise ValueError
             stamps.append(seconds_to_ns(words[0]))
             rows.append([float(word) for word in words[1:]])
-        except ValueError:
+            if not any(rows[-1][3:]):
+                raise ValueError
+        except (ValueError, OverflowError):
             raise LioJaxError(
-                f"{path}: line {number} is not 't x y z qx qy qz qw' (eight numbers); fix or remove it."
+                f"{path}: line {number} is not 't x y z qx qy qz qw' (eight numbers, no zero quaternion); "
+                "fix or remove it."
             ) from None
     if not rows:
         raise LioJaxError(

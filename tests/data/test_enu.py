@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lio_jax.data.enu import geodetic_to_ecef, geodetic_to_enu
+from lio_jax.data.enu import enu_to_geodetic, geodetic_to_ecef, geodetic_to_enu
 
 
 def test_earth_centred_positions() -> None:
@@ -40,3 +40,12 @@ def test_small_steps_follow_the_radii_of_curvature(latitude: float) -> None:
     north = (meridian + 120.0) * np.radians(step)
     east = (normal + 120.0) * np.cos(np.radians(latitude)) * np.radians(step)
     np.testing.assert_allclose(enu, [[0, north, 0], [east, 0, 0], [0, 0, 1]], atol=1e-5)
+
+
+def test_geodetic_round_trip_over_the_globe() -> None:
+    random = np.random.default_rng(0)
+    for _ in range(50):
+        origin = (random.uniform(-89, 89), random.uniform(-180, 180), random.uniform(-100, 5000))
+        position = random.normal(size=(8, 3)) * [5000, 5000, 500]
+        back = geodetic_to_enu(enu_to_geodetic(position, origin), origin)
+        np.testing.assert_allclose(back, position, atol=1e-6)

@@ -1,3 +1,6 @@
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -139,6 +142,40 @@ def test_a_failure_while_writing_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="sensor fell off"):
         write_native(tmp_path / "s", failing())
     assert list(tmp_path.iterdir()) == []
+
+
+WRITES_AND_IS_KILLED = """
+import os, signal, sys
+from pathlib import Path
+from lio_jax.data.native_writer import write_native
+from tests.data.test_native import scan_number
+
+def scans():
+    yield scan_number(0)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+write_native(Path(sys.argv[1]), scans())
+"""
+
+
+def test_what_a_killed_writer_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
+    killed = subprocess.run([sys.executable, "-c", WRITES_AND_IS_KILLED, tmp_path / "s"], timeout=60)
+    assert killed.returncode == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".s.")
+    write_native(tmp_path / "s", scans(1))
+    assert [entry.name for entry in tmp_path.iterdir()] == ["s"]
+
+
+def test_a_writer_that_lives_is_left_alone(tmp_path: Path) -> None:
+    def interleaved() -> Iterator[LidarScan]:
+        yield scan_number(0)
+        write_native(tmp_path / "s", scans(2))
+        yield scan_number(1)
+
+    write_native(tmp_path / "s", interleaved(), overwrite=True)
+    assert opened(tmp_path / "s").info.scan_count == 2
+    assert [entry.name for entry in tmp_path.iterdir()] == ["s"]
 
 
 def test_a_failure_while_overwriting_leaves_the_old_folder(tmp_path: Path) -> None:
