@@ -1,0 +1,1 @@
+"""Inertial measurements: sampling, preintegration, strapdown propagation, pose at any time."""

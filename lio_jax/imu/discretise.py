@@ -1,0 +1,50 @@
+"""Continuous-time noise densities to the variances of one interval's constant inputs."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from lio_jax.core.params import ImuParams
+
+UNKNOWN_RATE = 0.3
+"""Angular rate where no sample tells it, as white noise, rad/s/sqrt(Hz): 0.1 rad after 0.1 s."""
+UNKNOWN_ACCEL = 3.0
+"""Acceleration where no sample tells it, as white noise, m/s^2/sqrt(Hz): 1 m/s after 0.1 s."""
+
+
+class IntervalNoise(eqx.Module):
+    """Variances per axis of what disturbs each interval."""
+
+    gyro: Float[Array, " n"]
+    """Of the mean angular rate, (rad/s)^2."""
+    accel: Float[Array, " n"]
+    """Of the mean specific force, (m/s^2)^2."""
+    gyro_bias: Float[Array, " n"]
+    """Of the gyroscope's bias at the end against that at the start, (rad/s)^2."""
+    accel_bias: Float[Array, " n"]
+    """Of the accelerometer's bias at the end against that at the start, (m/s^2)^2."""
+
+
+def discretise(params: ImuParams, duration: Float[Array, " n"], known: Bool[Array, " n"]) -> IntervalNoise:
+    """Return the variances of what is constant in an interval of h seconds.
+
+    White noise: density^2 / h; a random walk from start to end: density^2 h. Linear
+    in the squares of the densities. An interval of no duration has no noise.
+
+    Args:
+        params: the sensor's densities.
+        duration: h, s.
+        known: False where no sample tells the motion: it is then white noise of the densities above.
+    """
+    real = duration > 0
+    per_second = jnp.where(real, 1 / jnp.where(real, duration, 1.0), 0.0)
+
+    def white(density: Float[Array, ""], unknown: float) -> Float[Array, " n"]:
+        return per_second * (density**2 + jnp.where(known, 0.0, unknown**2))
+
+    return IntervalNoise(
+        gyro=white(params.gyro_noise, UNKNOWN_RATE),
+        accel=white(params.accel_noise, UNKNOWN_ACCEL),
+        gyro_bias=params.gyro_bias_walk**2 * duration,
+        accel_bias=params.accel_bias_walk**2 * duration,
+    )

@@ -1,0 +1,219 @@
+"""The first navigation state of a vehicle at rest: level, biases and their joint uncertainty."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from lio_jax.core.error_state import (
+    ACCEL_BIAS,
+    DOF,
+    EXTRINSIC_ROTATION,
+    EXTRINSIC_TRANSLATION,
+    GRAVITY,
+    GYRO_BIAS,
+    ROTATION,
+    TIME_OFFSET,
+    VELOCITY,
+    Uncertain,
+    sphere_basis,
+)
+from lio_jax.core.params import ImuParams, InitialParams
+from lio_jax.core.types import ImuBatch, NavState, initial_nav_state
+from lio_jax.imu.rotation_integrals import skew
+
+MIN_SAMPLES = 5
+"""Fewer samples cannot show that the vehicle is at rest."""
+
+STILL_GYRO = 0.02
+"""Scatter of the angular rate that a running engine may cause at rest, beside the sensor's noise, rad/s."""
+STILL_ACCEL = 0.2
+"""The same of the specific force, m/s^2."""
+STILL_RATE = 0.1
+"""A larger mean rate is taken for a turn, not for a gyro bias, rad/s."""
+STILL_MISFIT = 0.05
+"""A mean specific force farther than this from gravity's strength, as a share of it, is not rest."""
+MOVING_ACCEL = 1.0
+"""Standard deviation of a moving vehicle's mean acceleration over about a second, m/s^2."""
+MOVING_SPEED = 10.0
+"""Standard deviation of a moving vehicle's first velocity per axis, m/s."""
+_UNKNOWN_TILT = 1.0
+"""Standard deviation of roll and pitch before gravity was looked at, rad."""
+
+
+class RestStart(eqx.Module):
+    """A first navigation state from samples that should be of a vehicle at rest."""
+
+    start: Uncertain
+    """At rest: levelled, biases found, velocity zero. Else: levelled roughly, biases zero, velocity open."""
+    is_still: Bool[Array, ""]
+    accel_scale: Float[Array, ""]
+    """Mean specific force over gravity: 1 for an ideal accelerometer at rest; 0 without samples."""
+    gyro_scatter: Float[Array, ""]
+    """Standard deviation of the angular rate over all axes, rad/s."""
+    accel_scatter: Float[Array, ""]
+    """Standard deviation of the specific force over all axes, m/s^2."""
+
+
+def initialise_at_rest(
+    imu: ImuBatch,
+    params: ImuParams,
+    initial: InitialParams,
+    T_imu_lidar: jaxlie.SE3,
+    time_offset: Float[Array, ""],
+) -> RestStart:
+    """Return the state of a vehicle that stood still while the samples were taken.
+
+    The mean angular rate is the gyro bias, the mean specific force points up (yaw is zero) and what it
+    exceeds gravity by is accelerometer bias along it; both biases are drawn towards zero by their prior
+    sigmas. Bias across gravity cannot be told from tilt, so the covariance couples the two. A zero sigma in
+    ``initial`` leaves that part of the state as it is, without uncertainty. A vehicle that turns out to move
+    is levelled as well, with an uncertainty that allows for its acceleration.
+
+    Args:
+        imu: about one second of samples up to the first pose.
+        params: the noise densities say what scatter is noise.
+        initial: prior standard deviations.
+        T_imu_lidar: extrinsic.
+        time_offset: of the lidar's clock, s.
+    """
+    present = jnp.any(imu.mask)
+    count = jnp.maximum(jnp.sum(imu.mask), 1)
+    gyro, gyro_variance = _mean_and_variance(imu.gyro, imu.mask)
+    accel, accel_variance = _mean_and_variance(imu.accel, imu.mask)
+    accel = jnp.where(present, accel, jnp.array([0.0, 0.0, 1.0]) * params.gravity)
+    strength = jnp.linalg.norm(accel)
+    rate = _sample_rate(imu)
+    gyro_noise = params.gyro_noise**2 * rate
+    accel_noise = params.accel_noise**2 * rate
+    steady = _is_steady(imu.gyro, imu.mask, gyro_variance, gyro_noise, STILL_GYRO) & _is_steady(
+        imu.accel, imu.mask, accel_variance, accel_noise, STILL_ACCEL
+    )
+    is_still = (
+        steady
+        & (count >= MIN_SAMPLES)
+        & (jnp.linalg.norm(gyro) < STILL_RATE)
+        & (jnp.abs(strength / params.gravity - 1) < STILL_MISFIT)
+    )
+
+    nav = eqx.tree_at(
+        lambda n: (n.T_world_imu, n.gravity, n.time_offset),
+        initial_nav_state(T_imu_lidar),
+        (
+            jaxlie.SE3.from_rotation(levelled(accel / strength)),
+            jnp.array([0.0, 0.0, -1.0]) * params.gravity,
+            time_offset,
+        ),
+    )
+    prior = _prior(nav, initial, is_still)
+    # the scatter of few samples may be small by chance
+    gyro_scatter, accel_scatter = jnp.mean(gyro_variance), jnp.mean(accel_variance)
+    gyro_error = jnp.maximum(gyro_scatter, gyro_noise / 4) / count
+    accel_error = jnp.maximum(accel_scatter, accel_noise / 4) / count
+    accel_error = jnp.where(is_still, accel_error, accel_scatter + MOVING_ACCEL**2)
+    correction, covariance = _seen_at_rest(nav, prior, gyro, gyro_error, accel, accel_error, is_still)
+    nav = eqx.tree_at(
+        lambda n: (n.gyro_bias, n.accel_bias),
+        nav,
+        (
+            jnp.where(is_still, correction[GYRO_BIAS], 0.0),
+            jnp.where(is_still, correction[ACCEL_BIAS], 0.0),
+        ),
+    )
+    return RestStart(
+        start=Uncertain(nav=nav, covariance=covariance),
+        is_still=is_still,
+        accel_scale=jnp.where(present, strength / params.gravity, 0.0),
+        gyro_scatter=jnp.sqrt(gyro_scatter),
+        accel_scatter=jnp.sqrt(accel_scatter),
+    )
+
+
+def levelled(up: Float[Array, "3"]) -> jaxlie.SO3:
+    """Return the rotation world from imu with yaw zero for which ``up`` (imu frame) is world z."""
+    roll = jnp.arctan2(up[1], up[2])
+    pitch = jnp.arctan2(-up[0], jnp.hypot(up[1], up[2]))
+    return jaxlie.SO3.from_rpy_radians(roll, pitch, jnp.zeros_like(roll))
+
+
+def _prior(nav: NavState, initial: InitialParams, is_still: Bool[Array, ""]) -> Float[Array, "24 24"]:
+    """Return the covariance before the samples were looked at: tilt open, heading fixed."""
+    velocity = jnp.where(is_still, initial.velocity_sigma, jnp.hypot(initial.velocity_sigma, MOVING_SPEED))
+    sigma = jnp.zeros(DOF, nav.velocity.dtype)
+    for part, value in (
+        (VELOCITY, velocity),
+        (GYRO_BIAS, initial.gyro_bias_sigma),
+        (ACCEL_BIAS, initial.accel_bias_sigma),
+        (GRAVITY, initial.gravity_sigma),
+        (EXTRINSIC_ROTATION, initial.extrinsic_rotation_sigma),
+        (EXTRINSIC_TRANSLATION, initial.extrinsic_translation_sigma),
+        (TIME_OFFSET, initial.time_offset_sigma),
+    ):
+        sigma = sigma.at[part].set(value)
+    up = nav.T_world_imu.rotation().inverse() @ jnp.array([0.0, 0.0, 1.0])
+    tilt = jnp.where(initial.rotation_sigma > 0, _UNKNOWN_TILT**2, 0.0)
+    level = tilt * (jnp.eye(3) - jnp.outer(up, up))
+    return jnp.diag(sigma**2).at[ROTATION, ROTATION].set(level)
+
+
+def _seen_at_rest(
+    nav: NavState,
+    prior: Float[Array, "24 24"],
+    gyro: Float[Array, "3"],
+    gyro_variance: Float[Array, ""],
+    accel: Float[Array, "3"],
+    accel_variance: Float[Array, ""],
+    use_gyro: Bool[Array, ""],
+) -> tuple[Float[Array, "24"], Float[Array, "24 24"]]:
+    """Return mean and covariance of the error state once the mean samples are known (a Kalman update)."""
+    back = nav.T_world_imu.rotation().inverse()
+    force = -(back @ nav.gravity)
+    H = jnp.zeros((6, DOF), prior.dtype)
+    H = H.at[:3, GYRO_BIAS].set(jnp.where(use_gyro, jnp.eye(3), 0.0))
+    H = H.at[3:, ACCEL_BIAS].set(jnp.eye(3))
+    H = H.at[3:, ROTATION].set(skew(force))
+    H = H.at[3:, GRAVITY].set(back.as_matrix() @ skew(nav.gravity) @ sphere_basis(nav.gravity))
+    # an unused row has no variance of its own and would make the system singular
+    gyro_variance = jnp.where(use_gyro, gyro_variance, 1.0)
+    R = jnp.diag(jnp.repeat(jnp.stack([gyro_variance, accel_variance]), 3))
+    gain = jnp.linalg.solve(H @ prior @ H.T + R, H @ prior).T
+    kept = jnp.eye(DOF) - gain @ H
+    covariance = kept @ prior @ kept.T + gain @ R @ gain.T
+    return gain @ jnp.concatenate([gyro, accel - force]), (covariance + covariance.T) / 2
+
+
+def _mean_and_variance(
+    samples: Float[Array, "m 3"], mask: Bool[Array, " m"]
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Return mean and scatter per axis over the real samples; zeros where there are none."""
+    count = jnp.sum(mask)
+    mean = jnp.sum(jnp.where(mask[:, None], samples, 0.0), axis=0) / jnp.maximum(count, 1)
+    square = jnp.sum(jnp.where(mask[:, None], (samples - mean) ** 2, 0.0), axis=0)
+    return mean, square / jnp.maximum(count - 1, 1)
+
+
+def _is_steady(
+    samples: Float[Array, "m 3"],
+    mask: Bool[Array, " m"],
+    variance: Float[Array, "3"],
+    noise_variance: Float[Array, ""],
+    tolerance: float,
+) -> Bool[Array, ""]:
+    """Return whether scatter and drift are those of a sensor at rest."""
+    rank = jnp.cumsum(mask)
+    early, _ = _mean_and_variance(samples, mask & (rank * 2 <= rank[-1]))
+    late, _ = _mean_and_variance(samples, mask & (rank * 2 > rank[-1]))
+    half = jnp.maximum(rank[-1] / 2, 1.0)
+    # a slow start hides in the noise of single samples but not in their mean
+    drift = jnp.linalg.norm(late - early)
+    calm = jnp.mean(variance) < tolerance**2 + 4 * noise_variance
+    return calm & (drift < tolerance + 4 * jnp.sqrt(2 * jnp.mean(variance) / half))
+
+
+def _sample_rate(imu: ImuBatch) -> Float[Array, ""]:
+    """Return the samples' rate, Hz; 0 where fewer than two."""
+    first = jnp.min(jnp.where(imu.mask, imu.time, jnp.inf))
+    last = jnp.max(jnp.where(imu.mask, imu.time, -jnp.inf))
+    intervals = jnp.sum(imu.mask) - 1
+    spread = jnp.where(intervals > 0, last - first, 1.0)
+    return jnp.maximum(intervals, 0) / jnp.maximum(spread, 1e-9)

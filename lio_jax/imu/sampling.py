@@ -1,0 +1,79 @@
+"""From a padded batch of inertial samples to intervals that cover a span of time exactly."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from lio_jax.core.types import ImuBatch
+
+LONGEST_GAP = 0.15
+"""Between samples farther apart than this, s, the motion counts as unknown; nor is a sample held longer."""
+
+
+class Intervals(eqx.Module):
+    """Consecutive intervals, in each of which the measured rate and specific force are constant."""
+
+    duration: Float[Array, " n"]
+    """s; 0 on padding."""
+    gyro: Float[Array, "n 3"]
+    """Mean measured angular rate, rad/s, IMU frame."""
+    accel: Float[Array, "n 3"]
+    """Mean measured specific force, m/s^2, IMU frame."""
+    known: Bool[Array, " n"]
+    """False where the samples are too far away to tell the motion."""
+    measured: Bool[Array, ""]
+    """False where there is no sample near the whole span: rates and forces are then zero."""
+
+
+def sample_intervals(
+    imu: ImuBatch, time_offset: Float[Array, ""], start: Float[Array, ""], end: Float[Array, ""]
+) -> Intervals:
+    """Cut the span from ``start`` to ``end`` at the samples and take the mean of each piece's two ends.
+
+    The signal is linear between samples, so it is interpolated at the span's ends, and the first and the last
+    sample are held. A sample stamped t by the IMU was taken at t - time_offset on the lidar's clock. Samples
+    may be in any order; those that are masked or not finite are left out. Without any, all intervals are zero
+    and not measured.
+
+    Args:
+        imu: m samples.
+        time_offset: lag of the lidar's clock, s.
+        start: s, same origin as the samples' times.
+        end: s, not before ``start``.
+
+    Returns:
+        m + 1 intervals, those outside the span with zero duration.
+    """
+    dtype = time_offset.dtype
+    signal = jnp.concatenate([imu.gyro, imu.accel], axis=1).astype(dtype)
+    valid = imu.mask & jnp.isfinite(imu.time) & jnp.all(jnp.isfinite(signal), axis=1)
+    order = jnp.argsort(jnp.where(valid, imu.time, jnp.inf))
+    valid = valid[order]
+    time = jnp.where(valid, imu.time[order].astype(dtype) - time_offset, end + 1)
+    signal = jnp.where(valid[:, None], signal[order], 0.0)
+    last = jnp.maximum(jnp.sum(valid) - 1, 0)
+
+    def signal_at(instant: Float[Array, ""], before: Array) -> Float[Array, "6"]:
+        left, right = jnp.clip(before, 0, last), jnp.clip(before + 1, 0, last)
+        width = time[right] - time[left]
+        share = (instant - time[left]) / jnp.where(width > 0, width, 1.0)
+        # the last sample is held: left and right are the same there
+        return signal[left] + jnp.where(width > 0, share, 0.0) * (signal[right] - signal[left])
+
+    at_start = signal_at(start, jnp.sum(valid & (time <= start)) - 1)
+    at_end = signal_at(end, jnp.sum(valid & (time < end)) - 1)
+    # selections, not minimum and maximum: at ties their derivative would be a mixture of both branches
+    early, late = time <= start, time >= end
+    knots = jnp.where(early, start, jnp.where(late, end, time))
+    values = jnp.where(early[:, None], at_start, jnp.where(late[:, None], at_end, signal))
+    knots = jnp.concatenate([start[None], knots, end[None]])
+    values = jnp.concatenate([at_start[None], values, at_end[None]])
+    duration = jnp.diff(knots)
+
+    between = jnp.concatenate([jnp.zeros(1, bool), valid[1:] & valid[:-1], jnp.zeros(1, bool)])
+    gap = jnp.where(between, jnp.diff(time, prepend=start, append=end), duration)
+    near = (time > start - LONGEST_GAP) | (jnp.max(jnp.where(valid, time, -jnp.inf)) >= end)
+    near &= (time < end + LONGEST_GAP) | (jnp.min(jnp.where(valid, time, jnp.inf)) <= start)
+    any_near = jnp.any(valid & near)
+    mean = jnp.where(any_near, (values[1:] + values[:-1]) / 2, 0.0)
+    return Intervals(duration, mean[:, :3], mean[:, 3:], (gap <= LONGEST_GAP) & any_near, any_near)
