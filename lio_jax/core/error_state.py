@@ -35,9 +35,9 @@ TIME_OFFSET = slice(23, 24)
 def retract(nav: NavState, error: Float[Array, "24"]) -> NavState:
     """Return ``nav [+] error``."""
     rotation = nav.T_world_imu.rotation()
-    turned = (rotation @ jaxlie.SO3.exp(error[ROTATION])).normalize()
+    turned = _unit(rotation @ jaxlie.SO3.exp(error[ROTATION]))
     position = nav.T_world_imu.translation() + rotation @ error[POSITION]
-    extrinsic = (nav.T_imu_lidar.rotation() @ jaxlie.SO3.exp(error[EXTRINSIC_ROTATION])).normalize()
+    extrinsic = _unit(nav.T_imu_lidar.rotation() @ jaxlie.SO3.exp(error[EXTRINSIC_ROTATION]))
     return NavState(
         T_world_imu=jaxlie.SE3.from_rotation_and_translation(turned, position),
         velocity=nav.velocity + rotation @ error[VELOCITY],
@@ -84,6 +84,14 @@ def sphere_basis(gravity: Float[Array, "3"]) -> Float[Array, "3 2"]:
         ],
         axis=1,
     )
+
+
+def _unit(rotation: jaxlie.SO3) -> jaxlie.SO3:
+    """Return the rotation at unit length, to the last bit as it is where it already has unit length."""
+    square = jnp.sum(rotation.wxyz**2)
+    # dividing by a norm that is one but for rounding would let a frozen rotation's last bits wander
+    as_it_is = jnp.abs(square - 1) < 8 * jnp.finfo(square.dtype).eps
+    return jaxlie.SO3(rotation.wxyz / jnp.where(as_it_is, 1.0, jnp.sqrt(square)))
 
 
 def _turn_between(start: Float[Array, "3"], end: Float[Array, "3"]) -> Float[Array, "3"]:

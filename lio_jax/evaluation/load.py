@@ -47,7 +47,9 @@ def load_trajectory(path: Path) -> LoadedTrajectory:
             return LoadedTrajectory(read_tum(path), True, str(path))
         if columns == 12:
             return _kitti(path)
-    except ValueError as error:
+    except UnicodeDecodeError:
+        raise LioJaxError(f"{path}: is not a text file; give a TUM or KITTI pose file.") from None
+    except (ValueError, OverflowError) as error:
         raise LioJaxError(f"{path}: not a trajectory ({error}); give a TUM or KITTI pose file.") from None
     raise LioJaxError(
         f"{path}: {columns} numbers in its first line; a TUM trajectory has 8 (t x y z qx qy qz qw), "

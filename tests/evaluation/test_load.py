@@ -116,12 +116,23 @@ def test_wrong_number_of_columns_is_an_error(tmp_path):
 def test_binary_file_is_an_error(tmp_path):
     path = tmp_path / "scan.bin"
     path.write_bytes(bytes(range(128, 256)))
-    with pytest.raises(LioJaxError, match=r"scan\.bin: not a trajectory"):
+    with pytest.raises(LioJaxError, match=r"scan\.bin: is not a text file; give a TUM or KITTI"):
         load_trajectory(path)
 
 
 def test_zero_quaternion_is_an_error(tmp_path):
     path = tmp_path / "zero.tum"
-    path.write_text("0 1 2 3 0 0 0 0\n")
-    with pytest.raises(LioJaxError, match=r"zero\.tum"):
+    path.write_text("0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 0\n")
+    with pytest.raises(LioJaxError, match=r"zero\.tum: line 2 is not .* no zero quaternion"):
         load_trajectory(path)
+
+
+@pytest.mark.parametrize("time", ["inf", "nan", "1e999"])
+def test_a_time_that_is_not_finite_is_an_error(tmp_path, time):
+    (tmp_path / "a.tum").write_text(f"{time} 1 2 3 0 0 0 1\n")
+    with pytest.raises(LioJaxError, match=r"a\.tum: line 1 is not 't x y z qx qy qz qw'"):
+        load_trajectory(tmp_path / "a.tum")
+    write_kitti_poses(tmp_path / "poses.txt", np.eye(4)[None])
+    (tmp_path / "times.txt").write_text(time)
+    with pytest.raises(LioJaxError, match=r"poses\.txt: not a trajectory"):
+        load_trajectory(tmp_path / "poses.txt")

@@ -1,0 +1,1 @@
+"""Estimation: the iterated error-state filter and its measurements."""

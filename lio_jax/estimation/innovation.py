@@ -1,0 +1,106 @@
+"""Innovation statistics at the cost of k x k algebra, however many residuals went into the measurement.
+
+With the measurement's information A = C C' and a prior covariance W of the k-dimensional quantity that it
+measures, everything follows from the k x k matrix I + C'WC: the covariance of the innovation in units of
+the measurement's own noise.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int32
+
+
+class Innovation(eqx.Module):
+    """What a measurement says against the prediction, in the directions that it observes."""
+
+    whitened: Float[Array, " k"]
+    """Innovation along the principal directions in units of the measurement's noise; zero if unobserved."""
+    factor: Float[Array, "k k"]
+    """Lower Cholesky factor of the covariance of ``whitened``."""
+    nis: Float[Array, ""]
+    """Normalised innovation squared: chi-square of ``dof`` degrees of freedom for a consistent filter."""
+    dof: Int32[Array, ""]
+    """Directions observed: the rank of the measurement's information."""
+    log_det: Float[Array, ""]
+    """Log-determinant of the innovation's covariance where observed, in the quantity's units."""
+
+    def log_likelihood(self) -> Float[Array, ""]:
+        """Return the log-density of the innovation, the measurement seen as one of ``dof`` dimensions."""
+        return -0.5 * (self.nis + self.log_det + self.dof * jnp.log(2 * jnp.pi))
+
+    def solve(self, right: Float[Array, "k n"]) -> Float[Array, "k n"]:
+        """Return the inverse covariance of ``whitened`` times ``right``."""
+        return jax.scipy.linalg.cho_solve((self.factor, True), right)
+
+
+def square_root_information(
+    information: Float[Array, "k k"], gradient: Float[Array, " k"]
+) -> tuple[Float[Array, "k k"], Float[Array, " k"], Float[Array, " k"]]:
+    """Return C with C C' = information, u with C u = gradient, and the eigenvalues, zero where unobserved.
+
+    Eigenvalues below the rounding error of the largest one, and negative ones, count as zero, and the
+    gradient's part along their directions is dropped.
+    """
+    values, vectors = jnp.linalg.eigh(information)
+    limits = jnp.finfo(values.dtype)
+    smallest = jnp.maximum(values.shape[0] * limits.eps * values[-1], limits.tiny)
+    values = jnp.where(values > smallest, values, 0.0)
+    root = jnp.sqrt(values)
+    along = vectors.T @ gradient
+    return vectors * root, jnp.where(root > 0, along / jnp.where(root > 0, root, 1.0), 0.0), values
+
+
+def innovation_of(
+    covariance: Float[Array, "k k"], whitened: Float[Array, " k"], eigenvalues: Float[Array, " k"]
+) -> Innovation:
+    """Return the statistics of a whitened innovation.
+
+    Args:
+        covariance: C'WC, the prior's share of the covariance of ``whitened``.
+        whitened: innovation in units of the measurement's noise.
+        eigenvalues: of the measurement's information, zero along unobserved directions.
+    """
+    observed = eigenvalues > 0
+    total = (covariance + covariance.T) / 2 + jnp.eye(whitened.shape[0], dtype=whitened.dtype)
+    factor = jnp.linalg.cholesky(total, symmetrize_input=False)
+    scaled = jax.scipy.linalg.solve_triangular(factor, whitened, lower=True)
+    noise = jnp.sum(jnp.where(observed, jnp.log(jnp.where(observed, eigenvalues, 1.0)), 0.0))
+    return Innovation(
+        whitened=whitened,
+        factor=factor,
+        nis=jnp.sum(scaled**2),
+        dof=jnp.sum(observed).astype(jnp.int32),
+        log_det=2 * jnp.sum(jnp.log(jnp.diagonal(factor))) - noise,
+    )
+
+
+def innovation_log_likelihood(
+    squared_error: Float[Array, ""],
+    log_det_noise: Float[Array, ""],
+    count: Float[Array, ""] | Int32[Array, ""],
+    information: Float[Array, "k k"],
+    gradient: Float[Array, " k"],
+    covariance: Float[Array, "k k"],
+) -> Float[Array, ""]:
+    """Return the log-density of all residuals of a measurement, predicted with covariance H W H' + R.
+
+    The m x m covariance is never formed: by the matrix determinant lemma and Woodbury's identity, with
+    T = I + C'WC and C u = gradient, ``log|HWH' + R| = log|R| + log|T|`` and
+    ``r'(HWH' + R)^-1 r = r'R^-1 r - u'T^-1 C'W gradient``.
+
+    Args:
+        squared_error: r' R^-1 r of the residuals at the prior mean.
+        log_det_noise: log|R|.
+        count: number m of residuals.
+        information: H' R^-1 H, H the derivative of the residuals with respect to the measured quantity.
+        gradient: H' R^-1 r.
+        covariance: W, the prior's of the measured quantity: J P J'.
+    """
+    root, along, values = square_root_information(information, gradient)
+    spread = covariance @ root
+    innovation = innovation_of(root.T @ spread, along, values)
+    explained = along @ innovation.solve((spread.T @ gradient)[:, None])[:, 0]
+    noise = jnp.sum(jnp.where(values > 0, jnp.log(jnp.where(values > 0, values, 1.0)), 0.0))
+    log_det = log_det_noise + innovation.log_det + noise
+    return -0.5 * (squared_error - explained + log_det + count * jnp.log(2 * jnp.pi))

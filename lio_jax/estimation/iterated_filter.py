@@ -1,0 +1,161 @@
+"""The iterated error-state update, over any state that has a retraction."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int32
+
+from lio_jax.estimation.innovation import Innovation, innovation_of, square_root_information
+
+CONVERGED, ITERATION_LIMIT, LOST, NOT_FINITE = 0, 1, 2, 3
+"""Status codes of an update; after LOST and NOT_FINITE the state and its covariance are the prior's."""
+
+State = TypeVar("State")
+"""Any pytree."""
+
+
+class Measurement(eqx.Module):
+    """What one linearisation tells about a k-dimensional quantity, such as a pose.
+
+    Its cost is quadratic in the quantity's perturbation d: ``d' information d / 2 + gradient' d``.
+    """
+
+    information: Float[Array, "k k"]
+    """Sum of H' R^-1 H over the residuals; directions without information are allowed."""
+    gradient: Float[Array, " k"]
+    """Sum of H' R^-1 r: it lies in the range of ``information``."""
+    jacobian: Float[Array, "k d"]
+    """Derivative of the quantity with respect to the error at the state that was measured."""
+    lost: Bool[Array, ""]
+    """The measurement is of no use: keep the prior."""
+    aux: Any = None
+    """Anything to hand to the next linearisation and back to the caller, as a pytree of arrays."""
+    settled: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.array(True))
+    """False keeps the iteration going: the measurement will still change, as with a kernel that narrows."""
+
+
+class Update(NamedTuple):
+    """Result of an update."""
+
+    state: Any
+    covariance: Float[Array, "d d"]
+    """Of the error at ``state``."""
+    innovation: Innovation
+    measurement: Measurement
+    """The last linearisation, at the iterate before ``state``."""
+    iterations: Int32[Array, ""]
+    status: Int32[Array, ""]
+    """CONVERGED, ITERATION_LIMIT, LOST or NOT_FINITE."""
+
+
+def iterated_update(
+    state: State,
+    covariance: Float[Array, "d d"],
+    measure: Callable[..., Measurement],
+    retract: Callable[[State, Float[Array, " d"]], State],
+    local: Callable[[State, State], Float[Array, " d"]],
+    *,
+    max_iterations: int,
+    tolerance: Float[Array, " d"],
+    first_aux: Any = None,
+    reset: Callable[[State, Float[Array, " d"]], Float[Array, "d d"]] | None = None,
+) -> Update:
+    """Return the state that best agrees with the prior and the measurement together, and its covariance.
+
+    Gauss-Newton on ``e' P^-1 e / 2`` plus the measurement's cost, where e is the error from the prior mean
+    and P its covariance (Bell & Cathey, "The iterated Kalman filter update as a Gauss-Newton method", 1993).
+    All iterates are errors from the prior mean, so that the prior's Jacobian is the identity and the manifold
+    enters only through the reset G(e) (Sola, "Quaternion kinematics for the error-state Kalman filter", 2017,
+    section 6.3). With the measurement's information A = C C', gradient C u and Jacobian J at the iterate e_j,
+    and H = C' J G(e_j), the next one is
+
+        e = P H' (I + H P H')^-1 (H e_j - u),
+
+    whose only inverse is k by k: neither P nor A needs one, what P holds as certain stays put to the last
+    bit, and directions without information are left alone. The posterior is in Joseph's form.
+
+    Args:
+        state: prior mean.
+        covariance: of the prior's error, positive semidefinite.
+        measure: ``state -> Measurement`` linearised there; called at each iterate, so it may re-associate.
+            With ``first_aux`` it is ``(state, aux) -> Measurement`` and also gets what the last linearisation
+            left in ``aux``, for instance associations to use once more.
+        retract: ``(state, error) -> state``.
+        local: its inverse, ``(state, other) -> error``.
+        max_iterations: bound of the loop, at least 1.
+        tolerance: converged when each component's step is at most this; infinite for those not to look at.
+        first_aux: the first linearisation's ``aux``, of the structure that every one returns.
+        reset: ``(state, e) ->`` derivative of ``local(retract(state, e), retract(state, e + w))`` with
+            respect to w at zero; by automatic differentiation where not given.
+    """
+    reset_at = reset or _reset_by_differentiation(retract, local)
+
+    def linearise(moved: State, aux: Any) -> Measurement:
+        return measure(moved) if first_aux is None else measure(moved, aux)
+
+    def iterate(carry: tuple) -> tuple:
+        error, iteration, _, _, _, last, *_ = carry
+        measured = linearise(retract(state, error), last.aux)
+        root, residual, values = square_root_information(measured.information, measured.gradient)
+        H = root.T @ (measured.jacobian @ reset_at(state, error))
+        PH = covariance @ H.T
+        innovation = innovation_of(H @ PH, residual - H @ error, values)
+        following = -PH @ innovation.solve(innovation.whitened[:, None])[:, 0]
+        lost = measured.lost | ~jnp.all(jnp.isfinite(following))
+        done = lost | (measured.settled & jnp.all(jnp.abs(following - error) <= tolerance))
+        return following, iteration + 1, done, lost, innovation, measured, H, PH
+
+    def unfinished(carry: tuple) -> Array:
+        return (carry[1] < max_iterations) & ~carry[2]
+
+    error = jnp.zeros(covariance.shape[0], covariance.dtype)
+    blank = _blank(jax.eval_shape(lambda: linearise(state, first_aux)))
+    measured = blank if first_aux is None else eqx.tree_at(lambda blank: blank.aux, blank, first_aux)
+    scalars = (error, jnp.int32(0), jnp.array(False), jnp.array(False))
+    shapes = jax.eval_shape(lambda: iterate((*scalars, None, measured, None, None)))
+    start = (*scalars, _blank(shapes[4]), measured, *_blank(shapes[6:]))
+    final: tuple = jax.lax.while_loop(unfinished, iterate, start)
+    error, iterations, done, lost, innovation, measured, H, PH = final
+
+    G = reset_at(state, error)
+    gain = innovation.solve(PH.T).T
+    kept = G - (G @ gain) @ H
+    posterior = kept @ covariance @ kept.T + (G @ gain) @ (G @ gain).T
+    finite = jnp.all(jnp.isfinite(error)) & jnp.all(jnp.isfinite(posterior))
+    lost = lost | ~finite
+    idle = lost | (innovation.dof == 0)
+    innovation = jax.tree.map(lambda leaf: jnp.where(idle, jnp.zeros_like(leaf), leaf), innovation)
+
+    def unless_idle(new: Array, old: Array) -> Array:
+        return jnp.where(idle, old, new)
+
+    status = jnp.where(done, CONVERGED, ITERATION_LIMIT)
+    status = jnp.where(lost, NOT_FINITE, status)
+    return Update(
+        state=jax.tree.map(unless_idle, retract(state, error), state),
+        covariance=unless_idle((posterior + posterior.T) / 2, covariance),
+        innovation=innovation,
+        measurement=measured,
+        iterations=iterations,
+        status=jnp.where(measured.lost, LOST, status).astype(jnp.int32),
+    )
+
+
+def _reset_by_differentiation(
+    retract: Callable[[State, Float[Array, " d"]], State],
+    local: Callable[[State, State], Float[Array, " d"]],
+) -> Callable[[State, Float[Array, " d"]], Float[Array, "d d"]]:
+    """Return ``reset`` of :func:`iterated_update` for any retraction and its inverse."""
+
+    def reset(state: State, error: Float[Array, " d"]) -> Float[Array, "d d"]:
+        moved = retract(state, error)
+        return jax.jacfwd(lambda small: local(moved, retract(state, error + small)))(jnp.zeros_like(error))
+
+    return reset
+
+
+def _blank(shapes: Any) -> Any:
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)

@@ -1,0 +1,84 @@
+"""The lidar's pose as a measurement of the navigation state."""
+
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from lio_jax.core.error_state import DOF, EXTRINSIC_ROTATION, EXTRINSIC_TRANSLATION, POSITION, ROTATION
+from lio_jax.core.types import NavState
+from lio_jax.estimation.iterated_filter import Measurement
+from lio_jax.imu.rotation_integrals import skew
+
+
+def lidar_pose_jacobian(nav: NavState) -> Float[Array, "6 24"]:
+    """Return the derivative of T_world_lidar = T_world_imu T_imu_lidar with respect to the error at ``nav``.
+
+    The pose's perturbation is that of the scan-to-map normal equations: in world axes at the sensor's
+    position, rotation before translation, R <- Exp(turn) R, t <- t + move.
+
+    The column of the time offset is zero. ``nav`` is the state at the instant of the lidar's stamp, because
+    propagation reads the inertial samples at time ``imu.time - time_offset``; an error of the offset shows in
+    the predicted pose, and its correlation with the pose comes from propagation. A column equal to the
+    lidar's twist belongs to the other convention, states kept by the IMU's clock: here it would count the
+    offset twice.
+    """
+    R_world_imu = nav.T_world_imu.rotation().as_matrix()
+    R_world_lidar = R_world_imu @ nav.T_imu_lidar.rotation().as_matrix()
+    jacobian = jnp.zeros((6, DOF), R_world_imu.dtype)
+    jacobian = jacobian.at[:3, ROTATION].set(R_world_imu)
+    jacobian = jacobian.at[3:, ROTATION].set(-R_world_imu @ skew(nav.T_imu_lidar.translation()))
+    jacobian = jacobian.at[3:, POSITION].set(R_world_imu)
+    jacobian = jacobian.at[:3, EXTRINSIC_ROTATION].set(R_world_lidar)
+    return jacobian.at[3:, EXTRINSIC_TRANSLATION].set(R_world_imu)
+
+
+def keep_observed(
+    information: Float[Array, "6 6"],
+    gradient: Float[Array, "6"],
+    arm_squared: Float[Array, ""],
+    degeneracy_ratio: Float[Array, ""],
+) -> tuple[Float[Array, "6 6"], Float[Array, "6"], Bool[Array, "6"]]:
+    """Return a scan match without its degenerate directions, and which they are, weakest first.
+
+    A direction with at most a share of the strongest direction's information is left to the prediction: what
+    little the scan seems to know there is the map's roughness (Zhang & Singh, "On degeneracy of
+    optimization-based state estimation problems", ICRA 2016). Rotations are scaled by the scan's rms lever
+    arm so that all six directions are in metres.
+
+    Args:
+        information: on the pose of the sensor, rotation (rad) before translation (m).
+        gradient: of half the squared error with respect to the same perturbation.
+        arm_squared: mean squared distance of the points from the sensor, m^2.
+        degeneracy_ratio: that share; 0 drops only what has no information at all.
+    """
+    dtype = information.dtype
+    scale = jnp.concatenate([jnp.full(3, 1.0) / jnp.sqrt(arm_squared + 1e-6), jnp.ones(3)]).astype(dtype)
+    values, vectors = jnp.linalg.eigh(scale[:, None] * information * scale)
+    degenerate = values <= jnp.maximum(degeneracy_ratio * values[-1], jnp.finfo(dtype).tiny)
+    unscaled = vectors / scale[:, None]
+    kept = (unscaled * jnp.where(degenerate, 0.0, values)) @ unscaled.T
+    along = jnp.where(degenerate, 0.0, vectors.T @ (scale * gradient))
+    return (kept + kept.T) / 2, unscaled @ along, degenerate
+
+
+def measured_pose(nav: NavState, T_world_lidar: jaxlie.SE3, information: Float[Array, "6 6"]) -> Measurement:
+    """Return the measurement that a known lidar pose makes of the navigation state.
+
+    Args:
+        nav: state at which to linearise.
+        T_world_lidar: the measured pose.
+        information: inverse covariance of its right perturbation, rotation (rad) before translation (m).
+    """
+    predicted = nav.T_world_imu @ nav.T_imu_lidar
+    missed = T_world_lidar.inverse() @ predicted
+    residual = jnp.concatenate([missed.rotation().log(), missed.translation()])
+    to_measured = T_world_lidar.rotation().inverse().as_matrix()
+    H = jnp.zeros((6, 6), residual.dtype)
+    # Exp(turn) on the left of the residual's rotation acts through its inverse left Jacobian
+    H = H.at[:3, :3].set(missed.rotation().inverse().jlog() @ to_measured).at[3:, 3:].set(to_measured)
+    return Measurement(
+        information=H.T @ information @ H,
+        gradient=H.T @ information @ residual,
+        jacobian=lidar_pose_jacobian(nav),
+        lost=jnp.array(False),
+    )
