@@ -53,8 +53,10 @@ class LidarConfig:
 
 @dataclass(frozen=True)
 class ImuConfig:
-    """Capacities of the inertial samples' arrays."""
+    """Use of the inertial samples."""
 
+    use: bool = True
+    """Couple the recording's inertial samples in; false: LiDAR odometry."""
     buckets: tuple[int, ...] = (32, 64, 128, 256, 512, 1024, 2048)
     """Padded numbers of samples between two scans; more than the last are thinned to it."""
 

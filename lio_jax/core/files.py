@@ -1,10 +1,15 @@
 """Files appear whole or not at all: written aside in the same folder, then renamed."""
 
+import fcntl
 import os
+import re
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+_TOKEN_BYTES = 4
 
 
 @contextmanager
@@ -13,9 +18,52 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
     The temporary keeps the suffix, because some writers choose their format by it.
     """
-    aside = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
+    aside = aside_of(path)
     try:
         yield aside
         os.replace(aside, path)
     finally:
         aside.unlink(missing_ok=True)
+
+
+def aside_of(path: Path) -> Path:
+    """Return a hidden name beside ``path`` that nobody else has."""
+    return path.with_name(f".{path.stem}.{secrets.token_hex(_TOKEN_BYTES)}{path.suffix}")
+
+
+def remove_leftovers(path: Path) -> None:
+    """Remove the files and folders that killed writers of ``path`` left under a name of :func:`aside_of`.
+
+    Folders whose lock is held stay. Files have none: only for a caller who knows that no other writer of
+    ``path`` is at work.
+    """
+    name = re.compile(rf"\.{re.escape(path.stem)}\.[0-9a-f]{{{2 * _TOKEN_BYTES}}}{re.escape(path.suffix)}")
+    for entry in path.parent.iterdir():
+        if name.fullmatch(entry.name):
+            if entry.is_dir() and not entry.is_symlink():
+                with folder_lock(entry) as free:
+                    if free:
+                        shutil.rmtree(entry, ignore_errors=True)
+            else:
+                entry.unlink(missing_ok=True)
+
+
+@contextmanager
+def folder_lock(folder: Path) -> Iterator[bool]:
+    """Hold the folder's lock during the block; yield whether it was free.
+
+    The system releases it when the process ends, however that happens. Where the file system knows no locks
+    the folder is taken to be free.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            free = True
+        except BlockingIOError:
+            free = False
+        except OSError:
+            free = True
+        yield free
+    finally:
+        os.close(descriptor)

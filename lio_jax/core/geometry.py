@@ -6,6 +6,8 @@ A symmetric matrix is given as its diagonal (xx, yy, zz) and its off-diagonal (x
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lio_jax.core.materialise import materialised
+
 
 def eigenvalues_and_normal3(
     diagonal: Float[Array, "*b 3"], off_diagonal: Float[Array, "*b 3"]
@@ -33,10 +35,12 @@ def eigenvalues_and_normal3(
     apart = jnp.where(thin, 2.0, -2.0) * jnp.cos(angle)
 
     bx, by, bz = ax - apart, ay - apart, az - apart
-    axis = _longest(
-        jnp.stack([xy * yz - xz * by, xz * xy - bx * yz, bx * by - xy**2], -1),
-        jnp.stack([xy * bz - xz * yz, xz**2 - bx * bz, bx * yz - xy * xz], -1),
-        jnp.stack([by * bz - yz**2, yz * xz - xy * bz, xy * yz - by * xz], -1),
+    axis = materialised(
+        _longest(
+            jnp.stack([xy * yz - xz * by, xz * xy - bx * yz, bx * by - xy**2], -1),
+            jnp.stack([xy * bz - xz * yz, xz**2 - bx * bz, bx * yz - xy * xz], -1),
+            jnp.stack([by * bz - yz**2, yz * xz - xy * bz, xy * yz - by * xz], -1),
+        )
     )
     u, v = _across(axis)
 
@@ -48,7 +52,7 @@ def eigenvalues_and_normal3(
     apart = form(axis, axis)
     uu, uv, vv = form(u, u), form(u, v), form(v, v)
     middle, half = (uu + vv) / 2, (uu - vv) / 2
-    radius = jnp.sqrt(jnp.maximum(half**2 + uv**2, tiny))
+    radius = jnp.sqrt(jnp.maximum(half**2 + uv**2, 1e-30))
     low, high = middle - radius, middle + radius
     # of the two rows of the 2x2 problem the one that does not cancel
     along_u = jnp.where(half > 0, uv, radius - half)

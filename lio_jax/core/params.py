@@ -59,6 +59,8 @@ class LidarParams(eqx.Module):
 
     range_sigma: Scalar
     """Standard deviation of a point against the map's surface, m."""
+    angle_sigma: Scalar
+    """Standard deviation of a beam's direction, rad: it counts at long range and grazing incidence."""
     min_range: Scalar
     """Nearer points are dropped, m."""
     max_range: Scalar
@@ -85,6 +87,10 @@ class RegistrationParams(eqx.Module):
     """The scan is thinned to one point per cube of this edge before it is matched, m."""
     kernel: Scalar
     """Scale of the Geman-McClure kernel, m."""
+    information_scale: Scalar
+    """Share of the matches' information that the filter believes: neighbours share the map's error."""
+    reassociation_distance: Scalar
+    """Points are matched anew once the scan has moved farther than this from where it was matched, m."""
     rotation_tolerance: Scalar
     """The solve has converged when a step turns less than this, rad ..."""
     translation_tolerance: Scalar
@@ -151,11 +157,13 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "extrinsic_translation_sigma": 0.0,
         "time_offset_sigma": 0.0,
     },
-    "lidar": {"range_sigma": 0.045, "min_range": 2.0, "max_range": 100.0},
+    "lidar": {"range_sigma": 0.045, "angle_sigma": 0.0, "min_range": 2.0, "max_range": 100.0},
     "map": {"voxel_size": 1.2, "point_spacing": 0.25, "min_points": 3.0, "reach": 120.0},
     "registration": {
         "point_spacing": 0.5,
         "kernel": 0.15,
+        "information_scale": 0.03,
+        "reassociation_distance": 0.015,
         "rotation_tolerance": 1e-4,
         "translation_tolerance": 1e-3,
         "degeneracy_ratio": 0.01,
@@ -200,11 +208,13 @@ _ANY_SIGN = {"extrinsics.translation", "extrinsics.time_offset"}
 _MAY_BE_ZERO = {
     *(f"initial.{name}" for name in DEFAULTS["initial"]),
     "lidar.min_range",
+    "lidar.angle_sigma",
+    "registration.reassociation_distance",
     "motion.initial_error",
     "registration.degeneracy_ratio",
     "motion.error_decay",
 }
-_AT_MOST_ONE = {"motion.error_decay", "registration.degeneracy_ratio"}
+_AT_MOST_ONE = {"motion.error_decay", "registration.degeneracy_ratio", "registration.information_scale"}
 
 
 def invalid_value(path: str, value: Any) -> str:

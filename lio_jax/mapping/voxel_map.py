@@ -1,4 +1,4 @@
-"""A hashed voxel table of fixed capacity that holds the running distribution of the points in each voxel.
+"""A hashed voxel table of fixed capacity: the running distribution of the points in each voxel and its plane.
 
 Coordinates inside a voxel are kept relative to its centre and voxel coordinates as integers, so float32 stays
 precise however far the vehicle drives. Points are given in an *anchored* frame: the world shifted by a whole
@@ -6,10 +6,13 @@ number of voxels, such that the vehicle is near its origin.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Float32, Int32, UInt32
 
+from lio_jax.core.geometry import eigenvalues_and_normal3
 from lio_jax.core.hashing import voxel_hash
+from lio_jax.core.materialise import materialised
 
 WAYS = 2
 """Slots a voxel may lie in: neighbours in memory, so that both are read together."""
@@ -17,6 +20,8 @@ FREE = -(2**31)
 """Coordinate that no voxel has."""
 SUBDIVISION = 4
 """Cells per voxel edge; each cell takes one point, remembered in 4 x 4 x 4 = 64 bits."""
+_BATCH = 4096
+"""Points inserted at a time: most scans bring fewer new ones, and pay for no more."""
 
 
 class VoxelMap(eqx.Module):
@@ -28,6 +33,10 @@ class VoxelMap(eqx.Module):
     """Count; sums of x y z; sums of xx yy zz xy xz yz; m, relative to the voxel's centre."""
     cells: UInt32[Array, "c 2"]
     """Bit set of the cells that hold a point."""
+    centroid: Float32[Array, "c 4"]
+    """Mean relative to the voxel's centre, m, and count: what a look-up compares."""
+    plane: Float32[Array, "c 5"]
+    """Unit normal and the two smaller variances, ascending, m^2: what a match uses."""
 
 
 class Insertion(eqx.Module):
@@ -39,15 +48,15 @@ class Insertion(eqx.Module):
     """Points whose voxel found no free slot: the table is too full."""
 
 
-class Distributions(eqx.Module):
-    """Mean and covariance of the map's points around each query."""
+class Planes(eqx.Module):
+    """The map's distribution around each query, seen as a plane."""
 
     mean: Float32[Array, "k 3"]
     """m, in the anchored frame."""
-    diagonal: Float32[Array, "k 3"]
-    """Variances xx yy zz, m^2."""
-    off_diagonal: Float32[Array, "k 3"]
-    """Covariances xy xz yz, m^2."""
+    normal: Float32[Array, "k 3"]
+    """Direction of the smallest variance, of unit length."""
+    variances: Float32[Array, "k 2"]
+    """The two smaller variances, ascending, m^2."""
     valid: Bool[Array, " k"]
     """False where no voxel around the query holds enough points."""
 
@@ -58,6 +67,8 @@ def empty_map(capacity: int) -> VoxelMap:
         voxel=jnp.full((capacity, 3), FREE, jnp.int32),
         moments=jnp.zeros((capacity, 10), jnp.float32),
         cells=jnp.zeros((capacity, 2), jnp.uint32),
+        centroid=jnp.zeros((capacity, 4), jnp.float32),
+        plane=jnp.zeros((capacity, 5), jnp.float32),
     )
 
 
@@ -73,7 +84,7 @@ def query_nearest(
     anchor: Int32[Array, "3"],
     voxel_size: Float32[Array, ""],
     min_points: Float32[Array, ""],
-) -> Distributions:
+) -> Planes:
     """Return, for each point, the distribution with the nearest mean among four voxels.
 
     The four are the point's own voxel and the face neighbour on the nearer side along each axis.
@@ -88,22 +99,26 @@ def query_nearest(
     scaled = points / voxel_size
     own = jnp.floor(scaled)
     side = jnp.where(scaled - own > 0.5, 1, -1).astype(jnp.int32)
-    offsets = jnp.concatenate([jnp.zeros((1, 3), jnp.int32), jnp.eye(3, dtype=jnp.int32)])
-    local = own.astype(jnp.int32)[:, None] + offsets * side[:, None]
-    slot = find_slots(vmap, local + anchor)
-    centre = (local.astype(jnp.float32) + 0.5) * voxel_size
-    count, sums = _count_and_sums(vmap.moments, jnp.maximum(slot, 0))
-    usable = (slot >= 0) & (count >= min_points)
-    away = points[:, None] - centre - sums / jnp.maximum(count, 1.0)[..., None]
-    distance = jnp.where(usable, jnp.sum(away**2, -1), jnp.inf)
-    row, best = jnp.arange(points.shape[0]), _smallest_column(distance)
-    moments = _take(vmap.moments, jnp.maximum(_take(slot, (row, best)), 0))
-    mean, diagonal, off_diagonal = _mean_and_covariance(moments)
-    return Distributions(
-        mean=_take(centre, (row, best)) + mean,
-        diagonal=diagonal,
-        off_diagonal=off_diagonal,
-        valid=jnp.any(usable, -1),
+    count = points.shape[0]
+    distance = jnp.full(count, jnp.inf, jnp.float32)
+    nearest = jnp.full(count, -1, jnp.int32)
+    for offset in jnp.concatenate([jnp.zeros((1, 3), jnp.int32), jnp.eye(3, dtype=jnp.int32)]):
+        local = own.astype(jnp.int32) + offset * side
+        slot = materialised(find_slots(vmap, local + anchor))
+        away = points - _mean(vmap, jnp.maximum(slot, 0), local, voxel_size)
+        squared = away[:, 0] ** 2 + away[:, 1] ** 2 + away[:, 2] ** 2
+        usable = (slot >= 0) & (_take(vmap.centroid, (jnp.maximum(slot, 0), 3)) >= min_points)
+        closer = usable & (squared < distance)
+        distance = jnp.where(closer, squared, distance)
+        nearest = jnp.where(closer, slot, nearest)
+    nearest = materialised(nearest)
+    found = jnp.maximum(nearest, 0)
+    plane = _take(vmap.plane, found)
+    return Planes(
+        mean=_mean(vmap, found, _take(vmap.voxel, found) - anchor, voxel_size),
+        normal=plane[:, :3],
+        variances=plane[:, 3:],
+        valid=nearest >= 0,
     )
 
 
@@ -129,31 +144,30 @@ def insert(
         voxel_size: edge length, m.
         reach: distance from the anchor beyond which voxels may be overwritten, m.
     """
-    capacity = vmap.voxel.shape[0]
-    scaled = points / voxel_size
-    local = jnp.floor(scaled)
-    fraction = scaled - local
-    voxel = local.astype(jnp.int32) + anchor
+    count = points.shape[0]
+    grid = _Grid(anchor, voxel_size, reach)
+    voxel, cell, _ = grid.places(points)
+    slot = materialised(find_slots(vmap, voxel))
+    new = mask & ~((slot >= 0) & _held(vmap, slot, cell))
+    rank = jnp.cumsum(new.astype(jnp.int32)) - 1
+    batch = min(_BATCH, count)
+    waiting = jnp.full(-(-count // batch) * batch, count, jnp.int32)
+    waiting = waiting.at[jnp.where(new, rank, waiting.shape[0])].set(
+        jnp.arange(count, dtype=jnp.int32), mode="drop"
+    )
 
-    slot, fresh, homeless = _claim_slots(vmap, voxel, mask, anchor, reach / voxel_size)
-    cleared = jnp.where(fresh, slot, capacity)
-    table_voxel = vmap.voxel.at[cleared].set(voxel, mode="drop")
-    moments = vmap.moments.at[cleared].set(0.0, mode="drop")
-    cells = vmap.cells.at[cleared].set(jnp.uint32(0), mode="drop")
+    def insert_batch(number: Array, carry: tuple[VoxelMap, Array, Array]) -> tuple[VoxelMap, Array, Array]:
+        vmap, added, dropped = carry
+        index = jax.lax.dynamic_slice(waiting, (number * batch,), (batch,))
+        row = jnp.minimum(index, count - 1)
+        vmap, fills, homeless = _insert_new(vmap, _take(points, row), index < count, grid)
+        added = added.at[jnp.where(fills, index, count)].set(True, mode="drop")
+        return vmap, added, dropped + jnp.sum(homeless, dtype=jnp.int32)
 
-    step = jnp.clip((fraction * SUBDIVISION).astype(jnp.int32), 0, SUBDIVISION - 1)
-    cell = (step[:, 0] * SUBDIVISION + step[:, 1]) * SUBDIVISION + step[:, 2]
-    word, bit = cell >> 5, jnp.uint32(1) << (cell & 31).astype(jnp.uint32)
-    held = (cells.at[jnp.maximum(slot, 0), word].get(mode="promise_in_bounds") & bit) != 0
-    wants = _one_per_cell((slot >= 0) & ~held, voxel * SUBDIVISION + step)
-
-    target = jnp.where(wants, slot, capacity)
-    x, y, z = jnp.moveaxis((fraction - 0.5) * voxel_size, -1, 0)
-    row = jnp.stack([jnp.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z], -1)
-    moments = moments.at[target].add(row, mode="drop")
-    cells = cells.at[target, word].add(bit, mode="drop")
-    report = Insertion(wants, jnp.sum(homeless, dtype=jnp.int32))
-    return VoxelMap(table_voxel, moments, cells), report
+    start = (vmap, jnp.zeros(count, bool), jnp.int32(0))
+    batches = (rank[-1] + batch) // batch
+    vmap, added, dropped = jax.lax.fori_loop(0, batches, insert_batch, start)
+    return vmap, Insertion(added, dropped)
 
 
 def find_slots(vmap: VoxelMap, voxel: Int32[Array, "*b 3"]) -> Int32[Array, "*b"]:
@@ -162,8 +176,75 @@ def find_slots(vmap: VoxelMap, voxel: Int32[Array, "*b 3"]) -> Int32[Array, "*b"
     slot = jnp.full(voxel.shape[:-1], -1, jnp.int32)
     for way in range(WAYS):
         candidate = first + way
-        slot = jnp.where(jnp.all(_take(vmap.voxel, candidate) == voxel, -1), candidate, slot)
+        x, y, z = (_take(vmap.voxel, (candidate, axis)) == voxel[..., axis] for axis in range(3))
+        slot = jnp.where(x & y & z, candidate, slot)
     return slot
+
+
+class _Grid(eqx.Module):
+    """Where points lie in the table's grid."""
+
+    anchor: Int32[Array, "3"]
+    voxel_size: Float32[Array, ""]
+    reach: Float32[Array, ""]
+
+    def places(
+        self, points: Float32[Array, "m 3"]
+    ) -> tuple[Int32[Array, "m 3"], Int32[Array, "m 3"], Float32[Array, "m 3"]]:
+        """Return each point's voxel, its cell therein, and its offset from the voxel's centre, m."""
+        scaled = points / self.voxel_size
+        local = jnp.floor(scaled)
+        fraction = scaled - local
+        cell = jnp.clip((fraction * SUBDIVISION).astype(jnp.int32), 0, SUBDIVISION - 1)
+        return local.astype(jnp.int32) + self.anchor, cell, (fraction - 0.5) * self.voxel_size
+
+
+def _insert_new(
+    vmap: VoxelMap, points: Float32[Array, "m 3"], mask: Bool[Array, " m"], grid: _Grid
+) -> tuple[VoxelMap, Bool[Array, " m"], Bool[Array, " m"]]:
+    """Insert one batch: the map, which points filled a cell, which found no slot."""
+    capacity = vmap.voxel.shape[0]
+    voxel, cell, offset = grid.places(points)
+    slot, fresh, homeless = _claim_slots(vmap, voxel, mask, grid.anchor, grid.reach / grid.voxel_size)
+    slot, fresh, homeless = materialised((slot, fresh, homeless))
+    cleared = jnp.where(fresh, slot, capacity)
+    table_voxel = vmap.voxel.at[cleared].set(voxel, mode="drop")
+    moments = vmap.moments.at[cleared].set(0.0, mode="drop")
+    cells = vmap.cells.at[cleared].set(jnp.uint32(0), mode="drop")
+    vmap = VoxelMap(table_voxel, moments, cells, vmap.centroid, vmap.plane)
+
+    fills = _one_per_cell((slot >= 0) & ~_held(vmap, slot, cell), voxel * SUBDIVISION + cell)
+    target = materialised(jnp.where(fills, slot, capacity))
+    x, y, z = jnp.moveaxis(offset, -1, 0)
+    row = jnp.stack([jnp.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z], -1)
+    moments = moments.at[target].add(row, mode="drop")
+    word, bit = _word_and_bit(cell)
+    cells = cells.at[target, word].add(bit, mode="drop")
+
+    mean, diagonal, off_diagonal = _mean_and_covariance(_take(moments, jnp.maximum(slot, 0)))
+    variances, normal = materialised(eigenvalues_and_normal3(diagonal, off_diagonal))
+    count = _take(moments, (jnp.maximum(slot, 0), 0))
+    centroid = jnp.concatenate([mean, count[:, None]], -1)
+    plane = jnp.concatenate([normal, jnp.maximum(variances[:, :2], 0.0)], -1)
+    vmap = VoxelMap(
+        table_voxel,
+        moments,
+        cells,
+        vmap.centroid.at[target].set(centroid, mode="drop"),
+        vmap.plane.at[target].set(plane, mode="drop"),
+    )
+    return vmap, fills, homeless
+
+
+def _held(vmap: VoxelMap, slot: Int32[Array, " m"], cell: Int32[Array, "m 3"]) -> Bool[Array, " m"]:
+    """Return which points' cells hold a point already, given a slot or -1."""
+    word, bit = _word_and_bit(cell)
+    return (_take(vmap.cells, (jnp.maximum(slot, 0), word)) & bit) != 0
+
+
+def _word_and_bit(cell: Int32[Array, "m 3"]) -> tuple[Int32[Array, " m"], UInt32[Array, " m"]]:
+    number = (cell[:, 0] * SUBDIVISION + cell[:, 1]) * SUBDIVISION + cell[:, 2]
+    return number >> 5, jnp.uint32(1) << (number & 31).astype(jnp.uint32)
 
 
 def _claim_slots(
@@ -203,6 +284,13 @@ def _one_per_cell(wants: Bool[Array, " m"], cell: Int32[Array, "m 3"]) -> Bool[A
     return wants & (winner.at[ticket].get(mode="fill", fill_value=-1) == order)
 
 
+def _mean(
+    vmap: VoxelMap, slot: Int32[Array, " k"], local: Int32[Array, "k 3"], voxel_size: Float32[Array, ""]
+) -> Float32[Array, "k 3"]:
+    """Return the means of slots that hold the voxels ``local`` of the anchored frame, m."""
+    return (local.astype(jnp.float32) + 0.5) * voxel_size + _take(vmap.centroid, slot)[:, :3]
+
+
 def _mean_and_covariance(moments: Float32[Array, "*b 10"]) -> tuple[Array, Array, Array]:
     count = jnp.maximum(moments[..., :1], 1.0)
     mean = moments[..., 1:4] / count
@@ -216,22 +304,5 @@ def _first_slot(vmap: VoxelMap, voxel: Int32[Array, "*b 3"]) -> Int32[Array, "*b
     return ((voxel_hash(voxel) & jnp.uint32(buckets - 1)) * WAYS).astype(jnp.int32)
 
 
-def _count_and_sums(
-    moments: Float32[Array, "c 10"], slot: Int32[Array, "*b"]
-) -> tuple[Float32[Array, "*b"], Float32[Array, "*b 3"]]:
-    """Gather only the count and the first powers."""
-    count, *sums = (moments.at[slot, column].get(mode="promise_in_bounds") for column in range(4))
-    return count, jnp.stack(sums, -1)
-
-
-def _smallest_column(values: Float32[Array, "k c"]) -> Int32[Array, " k"]:
-    """Return argmin over the columns: a chain of selections, several times faster than XLA's reduction."""
-    best, smallest = jnp.zeros(values.shape[0], jnp.int32), values[:, 0]
-    for column in range(1, values.shape[1]):
-        best = jnp.where(values[:, column] < smallest, column, best)
-        smallest = jnp.minimum(smallest, values[:, column])
-    return best
-
-
-def _take(table: Array, index: Array | tuple[Array, ...]) -> Array:
+def _take(table: Array, index: Array | tuple[Array | int, ...]) -> Array:
     return table.at[index].get(mode="promise_in_bounds")

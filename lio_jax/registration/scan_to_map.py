@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
-from lio_jax.core.geometry import eigenvalues_and_normal3
 from lio_jax.core.params import Params
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, query_nearest
 
@@ -47,58 +46,153 @@ class NormalEquations(eqx.Module):
     """Mean squared distance of the points from the sensor, m^2: scales rotations to metres."""
 
 
-def linearise(
+class Frame(eqx.Module):
+    """World axes from a corner of the map's grid near the sensor: where float32 is precise."""
+
+    anchor: Int32[Array, "3"]
+    """The voxel whose lower corner is the origin."""
+    origin: Float[Array, "3"]
+    """That corner, m in world."""
+
+    def place(
+        self, points: Float32[Array, "k 3"], T_world_lidar: jaxlie.SE3
+    ) -> tuple[Float32[Array, "k 3"], Float32[Array, "k 3"]]:
+        """Return points of the lidar frame in world axes, from the sensor and from the origin, m."""
+        arm = points @ T_world_lidar.rotation().as_matrix().astype(jnp.float32).T
+        return arm, arm + (T_world_lidar.translation() - self.origin).astype(jnp.float32)
+
+
+class Matches(eqx.Module):
+    """What each point was associated with, in world axes from ``origin``."""
+
+    mean: Float32[Array, "k 3"]
+    """m."""
+    normal: Float32[Array, "k 3"]
+    precision: Float32[Array, " k"]
+    """Of the distance along the normal, 1/m^2; zero where there is no match."""
+    used: Bool[Array, " k"]
+
+
+def associate(
     vmap: VoxelMap,
     points: Float32[Array, "k 3"],
     mask: Bool[Array, " k"],
     T_world_lidar: jaxlie.SE3,
+    frame: Frame,
+    params: Params,
+) -> Matches:
+    """Return the plane of the map that each point lies on at a pose.
+
+    A point is measured along the normal of its voxel, with the precision
+    k = 1 / (s^2 + l0) - 1 / (s^2 + l1), where l0 <= l1 are the two smaller variances of the voxel: what is
+    known about the normal in excess of the next direction. A flat voxel acts as a plane; a shapeless one does
+    not act at all, and neither does a single scan line, whose normal is undefined, with no class boundaries
+    between. The point's own variance s^2 is that of the range, plus that of the beam's direction times the
+    squared offset along the surface, which grows with range and grazing incidence.
+    """
+    arm, placed = frame.place(jnp.where(mask[:, None], points, 0.0), T_world_lidar)
+    near = query_nearest(
+        vmap,
+        placed,
+        frame.anchor,
+        params.map.voxel_size.astype(jnp.float32),
+        params.map.min_points.astype(jnp.float32),
+    )
+    along = jnp.sum(arm * near.normal, -1)
+    across = jnp.sum(arm**2, -1) - along**2
+    angle_sigma = params.lidar.angle_sigma.astype(jnp.float32)
+    noise = params.lidar.range_sigma.astype(jnp.float32) ** 2 + angle_sigma**2 * jnp.maximum(across, 0.0)
+    known = 1 / (noise[:, None] + near.variances)
+    used = mask & near.valid
+    return Matches(near.mean, near.normal, jnp.where(used, known[:, 0] - known[:, 1], 0.0), used)
+
+
+class Association(eqx.Module):
+    """The matches of a scan and the pose at which they were found."""
+
+    matches: Matches
+    T_world_lidar: jaxlie.SE3
+    arm: Float[Array, ""]
+    """Root mean square distance of the points from the sensor, m: what a turn moves them by."""
+
+
+def no_association(mask: Bool[Array, " k"], T_world_lidar: jaxlie.SE3) -> Association:
+    """Return an association that every pose is too far from."""
+    zeros = jnp.zeros((*mask.shape, 3), jnp.float32)
+    nowhere = jaxlie.SE3.from_rotation_and_translation(
+        T_world_lidar.rotation(), jnp.full_like(T_world_lidar.translation(), jnp.inf)
+    )
+    matches = Matches(zeros, zeros, zeros[:, 0], jnp.zeros_like(mask))
+    return Association(matches, nowhere, jnp.zeros((), nowhere.wxyz_xyz.dtype))
+
+
+def associated(
+    last: Association,
+    vmap: VoxelMap,
+    points: Float32[Array, "k 3"],
+    mask: Bool[Array, " k"],
+    T_world_lidar: jaxlie.SE3,
+    frame: Frame,
+    params: Params,
+) -> Association:
+    """Return the last association as long as the scan stays near it, else that at ``T_world_lidar``."""
+    turn = T_world_lidar.rotation().as_matrix() - last.T_world_lidar.rotation().as_matrix()
+    move = T_world_lidar.translation() - last.T_world_lidar.translation()
+    # |R - R'| = sqrt(2) |angle| for small angles, in Frobenius' norm
+    moved = jnp.linalg.norm(move) + last.arm * jnp.linalg.norm(turn) / jnp.sqrt(2.0)
+
+    def anew() -> Association:
+        squared = jnp.where(mask, jnp.sum(points**2, -1), 0.0)
+        arm = jnp.sqrt(jnp.sum(squared) / jnp.maximum(jnp.sum(mask), 1)).astype(last.arm.dtype)
+        return Association(associate(vmap, points, mask, T_world_lidar, frame, params), T_world_lidar, arm)
+
+    return jax.lax.cond(moved > params.registration.reassociation_distance, anew, lambda: last)
+
+
+def linearise(
+    matches: Matches,
+    points: Float32[Array, "k 3"],
+    T_world_lidar: jaxlie.SE3,
+    frame: Frame,
     kernel: Float[Array, ""],
     params: Params,
 ) -> NormalEquations:
-    """Associate the points with the map at a pose and return the weighted normal equations there.
+    """Return the robustly weighted normal equations of associated points at a pose.
 
-    A point at offset e from the mean of its voxel is measured along the voxel's normal n, with the precision
-    k = 1 / (s^2 + l0) - 1 / (s^2 + l1), where l0 <= l1 are the two smaller variances of the voxel and s is
-    the range noise: what is known about the normal in excess of the next direction. A flat voxel acts as a
-    plane; a shapeless one does not act at all, and neither does a single scan line, whose normal is
-    undefined, with no class boundaries between. Robust weight: Geman-McClure on s sqrt(k) n'e, the
-    noise-scaled distance in m.
+    Robust weight: Geman-McClure on s sqrt(k) n'e, the noise-scaled distance in m of a point at offset e from
+    its plane's mean, with precision k.
     """
     dtype = T_world_lidar.wxyz_xyz.dtype
-    voxel_size = params.map.voxel_size.astype(jnp.float32)
+    arm, placed = frame.place(jnp.where(matches.used[:, None], points, 0.0), T_world_lidar)
     noise = params.lidar.range_sigma.astype(jnp.float32) ** 2
-    anchor, corner = anchor_of(T_world_lidar.translation(), params.map.voxel_size)
-    rotation = T_world_lidar.rotation().as_matrix().astype(jnp.float32)
-    arm = points @ rotation.T
-    anchored = arm + (T_world_lidar.translation() - corner).astype(jnp.float32)
-    near = query_nearest(vmap, anchored, anchor, voxel_size, params.map.min_points.astype(jnp.float32))
-
-    variances, normal = eigenvalues_and_normal3(near.diagonal, near.off_diagonal)
-    known = 1 / (noise + jnp.maximum(variances, 0.0))
-    precision = jnp.maximum(known[:, 0] - known[:, 1], 0.0)
-    distance = jnp.sum(normal * (anchored - near.mean), -1)
-    distance_squared = noise * precision * distance**2
+    distance = jnp.where(matches.used, jnp.sum(matches.normal * (placed - matches.mean), -1), 0.0)
+    distance_squared = noise * matches.precision * distance**2
     kernel_squared = kernel.astype(jnp.float32) ** 2
-    used = mask & near.valid
-    weight = jnp.where(used, (kernel_squared / (kernel_squared + distance_squared)) ** 2, 0.0)
+    weight = jnp.where(matches.used, (kernel_squared / (kernel_squared + distance_squared)) ** 2, 0.0)
 
     # one matrix product gives every sum over the points: the normal equations from the rows, the rest from
     # the column of ones
     row = jnp.concatenate(
-        [jnp.cross(arm, normal), normal, distance[:, None], jnp.ones_like(distance)[:, None]], -1
+        [
+            jnp.cross(arm, matches.normal),
+            matches.normal,
+            distance[:, None],
+            jnp.ones_like(distance)[:, None],
+        ],
+        -1,
     )
-    matched = used.astype(jnp.float32)
+    matched = matches.used.astype(jnp.float32)
     scalars = [matched, weight, weight * distance_squared, matched * jnp.sum(arm**2, -1)]
-    weighted = jnp.concatenate([(weight * precision)[:, None] * row, jnp.stack(scalars, -1)], -1)
+    weighted = jnp.concatenate([(weight * matches.precision)[:, None] * row, jnp.stack(scalars, -1)], -1)
     sums = (row.T @ weighted).astype(dtype)
-    matches, weight_sum, squared_error, arm_squared = sums[7, 8:]
+    count, weight_sum, squared_error, arm_squared = sums[7, 8:]
     return NormalEquations(
         hessian=(sums[:6, :6] + sums[:6, :6].T) / 2,
         gradient=sums[:6, 6],
-        matches=matches.astype(jnp.int32),
+        matches=count.astype(jnp.int32),
         weight=weight_sum,
         squared_error=squared_error,
-        arm_squared=arm_squared / jnp.maximum(matches, 1.0),
+        arm_squared=arm_squared / jnp.maximum(count, 1.0),
     )
 
 
@@ -134,9 +228,14 @@ def register(
     def opening(iteration: Array) -> Array:
         return prediction_error * 0.5 ** iteration.astype(dtype)
 
+    frame = Frame(*anchor_of(T_world_lidar.translation(), params.map.voxel_size))
+
     def iterate(carry: tuple) -> tuple:
-        T, iteration, _, _, _ = carry
-        equations = linearise(vmap, points_at(T), mask, T, settings.kernel + opening(iteration), params)
+        T, iteration, _, association, _, _ = carry
+        points = points_at(T)
+        association = associated(association, vmap, points, mask, T, frame, params)
+        kernel = settings.kernel + opening(iteration)
+        equations = linearise(association.matches, points, T, frame, kernel, params)
         step, degenerate = _solve_observable(equations, settings.degeneracy_ratio)
         turn, move = step[:3], step[3:]
         T = jaxlie.SE3.from_rotation_and_translation(
@@ -146,15 +245,15 @@ def register(
             jnp.linalg.norm(move) < settings.translation_tolerance
         )
         done = (small & (opening(iteration) < settings.kernel)) | (equations.matches < settings.min_matches)
-        return T, iteration + 1, done, equations, degenerate
+        return T, iteration + 1, done, association, equations, degenerate
 
     def unfinished(carry: tuple) -> Array:
         return (carry[1] < max_iterations) & ~carry[2]
 
-    start = (T_world_lidar, jnp.int32(0), jnp.array(False))
-    shapes = jax.eval_shape(lambda: iterate((*start, None, None))[3:])
+    start = (T_world_lidar, jnp.int32(0), jnp.array(False), no_association(mask, T_world_lidar))
+    shapes = jax.eval_shape(lambda: iterate((*start, None, None))[4:])
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    T, iterations, done, equations, degenerate = jax.lax.while_loop(unfinished, iterate, (*start, *blank))
+    T, iterations, done, _, equations, degenerate = jax.lax.while_loop(unfinished, iterate, (*start, *blank))
 
     lost = (equations.matches < settings.min_matches) | ~jnp.all(jnp.isfinite(T.wxyz_xyz))
     T = jaxlie.SE3(jnp.where(lost, T_world_lidar.wxyz_xyz, T.wxyz_xyz))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lio_jax.core.files import atomic_path
+from lio_jax.core.files import aside_of, atomic_path, folder_lock, remove_leftovers
 
 
 def test_file_appears_when_the_block_ends(tmp_path):
@@ -63,3 +63,41 @@ def test_two_writers_of_one_file_do_not_share_a_temporary(tmp_path):
         two.write_text("two")
     assert target.read_text() == "one"
     assert os.listdir(tmp_path) == ["config.yaml"]
+
+
+@pytest.mark.parametrize("name", ["map.pcd", "drive", "a.b.bag", "odd [name] (1).txt"])
+def test_leftovers_are_those_of_the_one_file(tmp_path, name):
+    aside_of(tmp_path / name).write_text("half")
+    (aside_of(tmp_path / name) / "scans").mkdir(parents=True)
+    kept = {aside_of(tmp_path / f"other_{name}"), aside_of(tmp_path / f"{name}.zip"), tmp_path / name}
+    for path in kept:
+        path.touch()
+    remove_leftovers(tmp_path / name)
+    assert set(tmp_path.iterdir()) == kept
+
+
+def test_a_link_among_the_leftovers_is_removed_and_not_followed(tmp_path):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "precious").touch()
+    aside_of(tmp_path / "out").symlink_to(tmp_path / "data")
+    remove_leftovers(tmp_path / "out")
+    assert os.listdir(tmp_path) == ["data"]
+    assert (tmp_path / "data" / "precious").exists()
+
+
+def test_a_lock_is_held_once(tmp_path):
+    with folder_lock(tmp_path) as first, folder_lock(tmp_path) as second:
+        assert first
+        assert not second
+    with folder_lock(tmp_path) as again:
+        assert again
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_folder_whose_writer_lives_is_no_leftover(tmp_path):
+    living, dead = aside_of(tmp_path / "drive"), aside_of(tmp_path / "drive")
+    living.mkdir()
+    dead.mkdir()
+    with folder_lock(living):
+        remove_leftovers(tmp_path / "drive")
+    assert list(tmp_path.iterdir()) == [living]

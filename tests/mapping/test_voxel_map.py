@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert, query_nearest
+from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, find_slots, insert, query_nearest
 
 VOXEL = 1.2
 FAR = np.array([8333, -8333, 400])
@@ -18,6 +18,7 @@ FAR = np.array([8333, -8333, 400])
 
 _insert = jax.jit(insert)
 _query = jax.jit(query_nearest)
+_find = jax.jit(find_slots)
 
 
 class Report(NamedTuple):
@@ -49,7 +50,7 @@ def put(vmap: VoxelMap, points, anchor=(0, 0, 0), mask=None, reach=1000.0) -> tu
 
 
 def ask(vmap: VoxelMap, points, anchor=(0, 0, 0), min_points=1.0):
-    """Return valid, mean and full covariance in numpy."""
+    """Return valid, mean and full covariance in numpy; the plane has to be that of the covariance."""
     count = len(points)
     found = _query(
         vmap,
@@ -59,10 +60,27 @@ def ask(vmap: VoxelMap, points, anchor=(0, 0, 0), min_points=1.0):
         jnp.float32(min_points),
     )
     found = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], found)
-    covariance = np.zeros((count, 3, 3))
-    covariance[:, [0, 1, 2], [0, 1, 2]] = found.diagonal
-    covariance[:, [0, 0, 1], [1, 2, 2]] = covariance[:, [1, 2, 2], [0, 0, 1]] = found.off_diagonal
+    covariance = covariances(vmap, voxel_of(found.mean) + np.asarray(anchor))
+    covariance[~found.valid] = 0
+    for row in np.flatnonzero(found.valid):
+        values = np.linalg.eigvalsh(covariance[row])
+        along = found.normal[row] @ covariance[row] @ found.normal[row]
+        np.testing.assert_allclose(found.variances[row], values[:2], atol=2e-6)
+        np.testing.assert_allclose(along, values[0], atol=2e-6)
+        np.testing.assert_allclose(np.linalg.norm(found.normal[row]), 1, atol=1e-6)
     return found.valid, found.mean.astype(np.float64), covariance
+
+
+def covariances(vmap: VoxelMap, voxel) -> np.ndarray:
+    """Return the covariance of each voxel's points from the map's sums; zeros for voxels it does not hold."""
+    slot = np.asarray(_find(vmap, jnp.asarray(voxel, jnp.int32)))
+    moments = np.asarray(vmap.moments, np.float64)[np.maximum(slot, 0)] * (slot >= 0)[:, None]
+    count = np.maximum(moments[:, 0], 1)[:, None]
+    mean, second = moments[:, 1:4] / count, moments[:, 4:] / count
+    covariance = np.zeros((len(slot), 3, 3))
+    for column, (i, j) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
+        covariance[:, i, j] = covariance[:, j, i] = second[:, column] - mean[:, i] * mean[:, j]
+    return covariance
 
 
 def voxel_of(points) -> np.ndarray:

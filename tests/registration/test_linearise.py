@@ -10,15 +10,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.mapping.voxel_map import empty_map, insert
-from lio_jax.registration.scan_to_map import NormalEquations, linearise
+from lio_jax.mapping.voxel_map import anchor_of, empty_map, insert
+from lio_jax.registration.scan_to_map import Frame, NormalEquations, associate, linearise
 from tests.registration.scenes import map_of, matrix, params_with, pose
 
 VOXEL, SIGMA = 1.2, 0.05
 PARAMS = params_with(map__voxel_size=VOXEL, lidar__range_sigma=SIGMA)
 TRUTH = pose([0.7, -0.4, 0.9], [0.1, -0.2, 0.3])
 
-_linearise = jax.jit(linearise)
+
+@jax.jit
+def _linearise(vmap, points, mask, T, kernel, params) -> NormalEquations:
+    frame = Frame(*anchor_of(T.translation(), params.map.voxel_size))
+    matches = associate(vmap, points, mask, T, frame, params)
+    return linearise(matches, points, T, frame, kernel, params)
 
 
 def patches() -> list[np.ndarray]:

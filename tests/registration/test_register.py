@@ -75,8 +75,8 @@ def test_known_pose_comes_back(scene, metres, degrees, prediction_error, seed):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_narrow_kernel_opens_as_wide_as_the_prediction_may_be_wrong(seed):
-    """From 1 m away 5 cm of kernel see outliers only, unless the prediction's error is admitted."""
-    params = params_with(lidar__range_sigma=0.03, registration__kernel=0.05)
+    """From 1 m away 3 cm of kernel see outliers only, unless the prediction's error is admitted."""
+    params = params_with(lidar__range_sigma=0.03, registration__kernel=0.03)
     start, points = perturbed(1.0, 3.0, seed), scan_of("room", seed + 1)
     admitted, denied = (solve(MAPS["room"], points, start, error, params) for error in (2.0, 0.01))
     assert pose_error(admitted.T_world_lidar, TRUTH)[0] < 0.01
