@@ -13,6 +13,8 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg
 
+from lio_jax.commands.sim_options import ErrorOptions, Format, MotionOptions, SensorOptions
+from lio_jax.commands.usage import usage_in_a_sentence
 from lio_jax.core.errors import LioJaxError, UsageError
 
 Assignments = Annotated[
@@ -27,7 +29,7 @@ app = tyro.extras.SubcommandApp()
 
 @app.command(name="demo")
 def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("out/demo"), overwrite: Overwrite = False) -> None:
-    """Simulate a street, run on it and compare with the truth.
+    """Simulate a drive through a city, run on it and compare with the truth.
 
     Args:
         out: Folder for the results.
@@ -38,6 +40,39 @@ def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("out/demo"), overwrite:
 
     prepare_jax()
     command(out, overwrite)
+
+
+@app.command(name="sim")
+def sim(
+    world: Positional[Annotated[str, arg(metavar="WORLD")]],
+    out: Annotated[Path, arg(metavar="PATH")],
+    sensor: Annotated[str, arg(metavar="S")] = "vlp16",
+    duration: Annotated[float | None, arg(metavar="SEC")] = None,
+    seed: Annotated[int, arg(metavar="K")] = 0,
+    format: Annotated[Format | None, arg(name="format")] = None,
+    overwrite: Overwrite = False,
+    *,
+    motion: tyro.conf.OmitArgPrefixes[MotionOptions],
+    sensors: tyro.conf.OmitArgPrefixes[SensorOptions],
+    errors: tyro.conf.OmitArgPrefixes[ErrorOptions],
+) -> None:
+    """Simulate a recording whose truth is known: native folder or ROS bag.
+
+    Args:
+        world: World to move through; an unknown name lists those that exist.
+        out: What to write: *.bag (ROS 1), *.mcap or *.db3 (ROS 2), else a native folder. Beside a bag lie
+            NAME.truth.tum and NAME.truth.npz.
+        sensor: LiDAR; an unknown name lists those that exist.
+        duration: Length; None means 60 s, or all of --trajectory.
+        seed: Of world, motion and noise: the same seed gives the same bytes.
+        format: Instead of what PATH's ending says, such as a ROS 2 bag folder.
+        overwrite: Replace the recording that is there.
+    """
+    from lio_jax.commands.runtime import prepare_jax
+    from lio_jax.commands.sim import sim as command
+
+    prepare_jax()
+    command(world, sensor, duration, seed, out, format, overwrite, motion, sensors, errors)
 
 
 @app.command(name="inspect")
@@ -104,13 +139,34 @@ def evaluate(
     command(estimate, reference, json)
 
 
+@app.command(name="calibrate-imu")
+def calibrate_imu(
+    data: Positional[Annotated[Path, arg(metavar="STATIC_DATA")]],
+    out: Annotated[Path, arg(metavar="FILE.yaml")],
+    plot: Annotated[Path | None, arg(metavar="FILE.png")] = None,
+    skip: Annotated[float, arg(metavar="SEC")] = 0.0,
+) -> None:
+    """Find an IMU's noise densities in a recording of it at rest, by its Allan deviation.
+
+    Args:
+        data: Recording at rest, or the imu.npz of a native folder.
+        out: Settings file for --recipe.
+        plot: Picture of the Allan deviation.
+        skip: Leave out this much at the start, s.
+    """
+    from lio_jax.commands.calibrate_imu import calibrate_imu as command
+
+    command(data, out, plot, skip)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
     try:
         words = _gathered([word for word in words if word != "--debug"])
-        app.cli(args=words, prog="lio-jax", description=_DESCRIPTION)
+        with usage_in_a_sentence(words, app):
+            app.cli(args=words, prog="lio-jax", description=_DESCRIPTION)
         sys.stdout.flush()
     except SystemExit as leaving:
         return leaving.code if isinstance(leaving.code, int) else 2

@@ -29,7 +29,7 @@ class LioJaxSystem:
         settings, step = _compiled(T_imu_lidar.tobytes(), overrides)
         self._config = settings.config.lidar
         self._pending: LidarScan
-        self._results = track(settings, self._feed(), step)
+        self._results = track(settings, self._feed(), step=step)
 
     def warm_up(self, scans: list[LidarScan]) -> None:
         by_bucket = {bucket_for(len(scan.points), self._config): scan for scan in reversed(scans)}

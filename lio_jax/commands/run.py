@@ -14,8 +14,8 @@ from lio_jax.data.open import open_sequence
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.recipes import recipe_named
-from lio_jax.run.folder import prepare_folder, write_json
-from lio_jax.run.run import Observer, RunResult, run_sequence, settings_for
+from lio_jax.run.folder import run_folder, write_json
+from lio_jax.run.run import Observer, RunResult, check_start, run_sequence, settings_for
 from lio_jax.run.track import Tracked
 from lio_jax.viz.recording import Recording
 
@@ -63,14 +63,28 @@ def run_and_report(
     """Run a recording into a folder, evaluate against truth, draw, and say what came out.
 
     Raises:
+        UsageError: the recording ends before ``start``, or the folder may not be written.
         LioJaxError: nothing could be read, or the run ended early; what was computed is written.
     """
+    check_start(sequence, start)
+    with run_folder(out, overwrite):
+        return _run_into(sequence, settings, out, start, count, truth)
+
+
+def _run_into(
+    sequence: Sequence,
+    settings: Settings,
+    out: Path,
+    start: int,
+    count: int | None,
+    truth: Trajectory | None,
+) -> RunResult:
     settings, notes = settings_for(sequence, settings)
-    prepare_folder(out, overwrite)
     info = sequence.info
     for note in (*info.notes, *notes):
         say(f"note: {note}")
-    total = max(0, info.scan_count - start) if count is None else min(count, max(0, info.scan_count - start))
+    remaining = max(0, info.scan_count - start)
+    total = remaining if count is None else min(count, remaining)
     with ExitStack() as stack:
         observers: list[Observer] = []
         recording = None
@@ -193,6 +207,7 @@ def _summary(result: RunResult, out: Path) -> str:
     return "\n".join(
         [
             f"scans      {metrics['scans']}  ({steps.sum():.2f} m travelled)",
+            f"predicted  by {metrics['prediction']}",
             f"per scan   {total['median']:.1f} ms median, {total['p95']:.1f} ms p95",
             f"compile    {metrics['compile_s']:.2f} s",
             f"wall       {metrics['wall_s']:.1f} s",

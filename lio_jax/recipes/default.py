@@ -1,192 +1,51 @@
-"""The default recipe in its LiDAR-only form: constant velocity, voxel distributions, robust Gauss-Newton.
-
-scan -> thin -> predict -> register (deskewing under trial) -> deskew -> insert -> map
-"""
-
-import equinox as eqx
-import jax
-import jax.numpy as jnp
-import jaxlie
-from jaxtyping import Array, Bool, Float, Float32, Int32
+"""The default recipe: tightly coupled with inertial data, LiDAR odometry where there is none."""
 
 from lio_jax.core.config import Config
 from lio_jax.core.params import Params
-from lio_jax.core.types import ImuBatch, NavState, Scan, initial_nav_state
-from lio_jax.lidar.deskew import deskew_constant_velocity
-from lio_jax.lidar.downsample import select_per_voxel
-from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
-from lio_jax.registration.scan_to_map import TOO_FEW_MATCHES, Registration, register
+from lio_jax.core.types import ImuBatch, Scan
+from lio_jax.recipes import lidar_inertial, lidar_odometry
+from lio_jax.recipes.output import Output
+
+State = lidar_inertial.State | lidar_odometry.State
 
 
-class State(eqx.Module):
-    """What is carried from scan to scan."""
-
-    nav: NavState
-    """At the last scan's end."""
-    T_world_lidar: jaxlie.SE3
-    """At the middle of the last scan: the instant registration solves for, where deskewing errs least."""
-    mid_to_end: Float[Array, ""]
-    """From that instant to the scan's end, s."""
-    twist: Float[Array, "6"]
-    """Velocity of the lidar in its own frame, m/s then rad/s."""
-    prediction_error: Float[Array, ""]
-    """Expected error of the next prediction, m."""
-    scans: Int32[Array, ""]
-    """Scans with points seen so far."""
-    map: VoxelMap
-
-
-class Output(eqx.Module):
-    """What a step reports beside the state."""
-
-    registration: Registration
-    lost: Bool[Array, ""]
-    """The scan could not be matched; the pose is the prediction and the map was left alone."""
-    points: Float32[Array, "m 3"]
-    """The thinned scan, motion compensated, in world axes from ``origin``, m."""
-    points_mask: Bool[Array, " m"]
-    added: Bool[Array, " m"]
-    """Which of ``points`` were new to the map."""
-    origin: Float[Array, "3"]
-    """Where ``points`` count from, m in world."""
-    thinned_away: Int32[Array, ""]
-    """Occupied cells of the scan beyond its capacities: they thin the scan further, evenly."""
-    map_dropped: Int32[Array, ""]
-    """Points whose voxel found no room in the map."""
-
-
-def init(config: Config, params: Params, twist: Float[Array, "6"] | None = None) -> State:
-    """Return the state before the first scan: at the world's origin, with an empty map.
+def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
+    """Return the state before the first scan.
 
     Args:
         config: static.
         params: traced.
-        twist: velocity of the lidar in its own frame, m/s then rad/s; None: at rest.
+        imu: samples of about a second up to the first scan's end; None: there are no inertial data.
     """
-    nav = initial_nav_state(params.extrinsics.T_imu_lidar())
-    dtype = nav.velocity.dtype
-    return State(
-        nav=nav,
-        T_world_lidar=nav.T_world_imu @ nav.T_imu_lidar,
-        mid_to_end=jnp.zeros((), dtype),
-        twist=jnp.zeros(6, dtype) if twist is None else twist,
-        prediction_error=jnp.asarray(params.motion.initial_error, dtype),
-        scans=jnp.int32(0),
-        map=empty_map(config.map.capacity),
-    )
+    if imu is None:
+        return lidar_odometry.init(config, params)
+    return lidar_inertial.init(config, params, imu)
 
 
-def restart(config: Config, params: Params, state: State) -> State:
+def restart(config: Config, params: Params, state: State, imu: ImuBatch | None = None) -> State:
     """Return the state before the first scan once more, now with the velocity that ``state`` found.
 
     A vehicle that is already moving distorts its first scan, which nothing can compensate until the second.
     """
-    return init(config, params, state.twist)
+    if isinstance(state, lidar_odometry.State):
+        return lidar_odometry.init(config, params, state.twist)
+    assert imu is not None
+    return lidar_inertial.init(config, params, imu, state.uncertain.nav.velocity)
 
 
 def step(
     config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch | None = None
 ) -> tuple[State, Output]:
-    """Register one scan and add it to the map.
-
-    Velocity is taken as constant from the middle of the last scan to the middle of this one, and is solved
-    for together with the pose: each trial pose deskews the scan with the velocity it implies.
+    """Estimate one scan's pose and add the scan to the map.
 
     Args:
         config: static.
         params: traced.
-        state: donate it.
-        scan: padded sweep; ``scan.interval`` is the time since the last scan's end.
-        imu: not used by the LiDAR-only form.
+        state: of the form that ``init`` chose; donate it.
+        scan: padded sweep.
+        imu: samples around the time since the last scan's end.
     """
-    with jax.named_scope("thin"):
-        points, delay, mask, thinned_away = _thin(config, params, scan)
-        matched = select_per_voxel(
-            points, mask, params.registration.point_spacing, config.lidar.registration_points
-        )
-    with jax.named_scope("predict"):
-        middle = 0.5 * scan.duration.astype(state.twist.dtype)
-        first = state.scans == 0
-        # the first scan's end is the world's origin, however many empty scans went before
-        interval = jnp.where(first, 0.0, scan.interval.astype(state.twist.dtype))
-        elapsed = state.mid_to_end + interval - middle
-        prediction = state.T_world_lidar @ jaxlie.SE3.exp(elapsed * state.twist)
-        T_last_inverse = state.T_world_lidar.inverse()
-
-        def twist_to(T_world_lidar: jaxlie.SE3) -> Array:
-            moved = (T_last_inverse @ T_world_lidar).log()
-            known = ~first & (elapsed > 0)
-            return jnp.where(known, moved / jnp.where(known, elapsed, 1.0), state.twist)
-
-    with jax.named_scope("register"):
-        result = register(
-            state.map,
-            lambda T: deskew_constant_velocity(points[matched.index], delay[matched.index], twist_to(T)),
-            matched.mask,
-            prediction,
-            state.prediction_error,
-            params,
-            config.registration.max_iterations,
-        )
-        lost = (result.status == TOO_FEW_MATCHES) & ~first
-        twist = jnp.where(lost, state.twist, twist_to(result.T_world_lidar))
-        missed = jnp.linalg.norm((prediction.inverse() @ result.T_world_lidar).translation())
-        error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
-        error = jnp.where(first | lost, state.prediction_error, error)
-    with jax.named_scope("insert"):
-        T = result.T_world_lidar
-        anchor, corner = anchor_of(T.translation(), params.map.voxel_size)
-        shift = (T.translation() - corner).astype(jnp.float32)
-        deskewed = deskew_constant_velocity(points, delay, twist)
-        anchored = deskewed @ T.rotation().as_matrix().astype(jnp.float32).T + shift
-        vmap, added = insert(
-            state.map,
-            anchored,
-            mask & ~lost,
-            anchor,
-            params.map.voxel_size.astype(jnp.float32),
-            params.map.reach.astype(jnp.float32),
-        )
-
-    T_world_imu = T @ jaxlie.SE3.exp(middle * twist) @ params.extrinsics.T_imu_lidar().inverse()
-    nav = eqx.tree_at(
-        lambda nav: (nav.T_world_imu, nav.velocity),
-        state.nav,
-        (jaxlie.SE3(T_world_imu.wxyz_xyz), _imu_velocity(T_world_imu, twist, params)),
-    )
-    seen = jnp.any(mask)
-    new_state = State(
-        nav=nav,
-        T_world_lidar=T,
-        mid_to_end=middle,
-        twist=twist,
-        prediction_error=error,
-        scans=state.scans + seen.astype(jnp.int32),
-        map=vmap,
-    )
-    return new_state, Output(
-        registration=result,
-        lost=lost,
-        points=anchored,
-        points_mask=mask,
-        added=added.added,
-        origin=corner,
-        thinned_away=thinned_away + matched.dropped,
-        map_dropped=added.dropped,
-    )
-
-
-def _thin(config: Config, params: Params, scan: Scan) -> tuple[Array, Array, Array, Array]:
-    """Return the points for the map, their delay after the scan's middle (s), mask and overflow."""
-    squared_range = jnp.sum(scan.points**2, -1)
-    near, far = params.lidar.min_range.astype(jnp.float32), params.lidar.max_range.astype(jnp.float32)
-    mask = scan.mask & (squared_range > near**2) & (squared_range < far**2)
-    chosen = select_per_voxel(scan.points, mask, params.map.point_spacing, config.lidar.insertion_points)
-    delay = scan.time[chosen.index] - 0.5 * scan.duration
-    return scan.points[chosen.index], delay, chosen.mask, chosen.dropped
-
-
-def _imu_velocity(T_world_imu: jaxlie.SE3, twist: Float[Array, "6"], params: Params) -> Float[Array, "3"]:
-    """Return the IMU origin's velocity in world from the lidar's twist in its own frame."""
-    in_imu = params.extrinsics.T_imu_lidar().adjoint() @ twist
-    return T_world_imu.rotation() @ in_imu[:3]
+    if isinstance(state, lidar_odometry.State):
+        return lidar_odometry.step(config, params, state, scan)
+    assert imu is not None
+    return lidar_inertial.step(config, params, state, scan, imu)

@@ -1,11 +1,14 @@
 """The run folder: refuse to overwrite by accident, write every file whole."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.files import atomic_path
+from lio_jax.core.files import atomic_path, folder_lock, remove_leftovers
+from lio_jax.run.map_file import SPOOL_SUFFIX
 
 RUN_FILES = (
     "trajectory.tum",
@@ -21,23 +24,44 @@ RUN_FILES = (
 )
 """What a run may write."""
 
+_SPOOL = f"map{SPOOL_SUFFIX}"
 
-def prepare_folder(path: Path, overwrite: bool) -> None:
-    """Make an empty run folder.
 
-    With ``overwrite`` the files of an earlier run are removed and nothing else.
+@contextmanager
+def run_folder(path: Path, overwrite: bool) -> Iterator[None]:
+    """Hold an empty run folder during the block; one made for it that stays empty is removed again.
+
+    With ``overwrite`` the files of an earlier run are removed and nothing else. The hidden files of a killed
+    run are removed in any case, and do not count.
 
     Raises:
-        UsageError: something is there already and ``overwrite`` is not set, or the folder cannot be made.
+        UsageError: something is there already and ``overwrite`` is not set, another run is writing there, or
+            the folder cannot be made.
     """
     if path.is_file():
         raise UsageError(f"{path}: is a file; give a folder for the run's results.")
-    if path.is_dir() and any(path.iterdir()) and not overwrite:
-        raise UsageError(f"{path}: exists and is not empty; choose another folder or add --overwrite.")
+    made = not path.exists()
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{path}: the folder cannot be made ({error.strerror}).") from None
+    try:
+        with folder_lock(path) as free:
+            if not free:
+                raise UsageError(f"{path}: another run is writing there; choose another folder.")
+            _make_empty(path, overwrite)
+            yield
+    finally:
+        if made:
+            with suppress(OSError):  # it holds results
+                path.rmdir()
+
+
+def _make_empty(path: Path, overwrite: bool) -> None:
+    for name in (*RUN_FILES, _SPOOL):
+        remove_leftovers(path / name)
+    if any(path.iterdir()) and not overwrite:
+        raise UsageError(f"{path}: exists and is not empty; choose another folder or add --overwrite.")
     for name in RUN_FILES:
         (path / name).unlink(missing_ok=True)
 

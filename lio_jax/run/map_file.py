@@ -1,13 +1,13 @@
 """Collect the map's points on disk while a run goes on, so that its memory does not grow."""
 
-import secrets
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.files import atomic_path
+from lio_jax.core.files import aside_of, atomic_path
 
+SPOOL_SUFFIX = ".spool"
 _POINT_BYTES = 3 * np.dtype(np.float32).itemsize
 
 
@@ -16,7 +16,7 @@ class MapFile:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._spool_path = path.with_name(f".{path.name}.{secrets.token_hex(4)}.spool")
+        self._spool_path = aside_of(path.with_suffix(SPOOL_SUFFIX))
         self._spool = self._spool_path.open("wb")
 
     def append(self, points: NDArray[np.float32]) -> None:

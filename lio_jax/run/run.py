@@ -13,14 +13,16 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.errors import LioJaxError
+from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.core.files import atomic_path
 from lio_jax.core.settings import Settings, with_extrinsics
+from lio_jax.data.imu_checks import cleaned
 from lio_jax.data.prefetch import prefetched
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.data.trajectory import Trajectory, write_kitti_poses, write_tum
 from lio_jax.loops.g2o import write_g2o
 from lio_jax.run.folder import write_json, write_text
+from lio_jax.run.imu_feed import OFFSET_MARGIN_S, ImuFeed
 from lio_jax.run.keyframes import keyframe_indices, odometry_edges
 from lio_jax.run.map_file import MapFile
 from lio_jax.run.overflow import Overflow
@@ -88,10 +90,13 @@ def run_sequence(
         observers: called after each scan.
 
     Raises:
+        UsageError: the recording ends before ``start``.
         LioJaxError: no scan could be read.
     """
+    check_start(sequence, start)
     began = time.perf_counter()
     step = CompiledStep(settings)
+    imu, imu_notes = imu_feed(sequence, settings)
     log = TrajectoryLog()
     stage_ms: dict[str, list[float]] = {"decode": [], "pad": [], "step": [], "record": [], "total": []}
     failures: list[dict[str, Any]] = []
@@ -104,7 +109,7 @@ def run_sequence(
         try:
             # closing: an observer that raises must not leave the decoding thread and its files behind
             with closing(scans):
-                for tracked in track(settings, scans, step):
+                for tracked in track(settings, scans, imu, step):
                     recorded_from = time.perf_counter()
                     for stage, value in tracked.stage_ms.items():
                         stage_ms[stage].append(value)
@@ -122,7 +127,8 @@ def run_sequence(
         if not len(log):
             if interruption is not None:
                 raise interruption
-            raise LioJaxError(_nothing_read(sequence, start))
+            reasons = " ".join(sequence.warnings_so_far)
+            raise LioJaxError(f"{sequence.info.path}: no scan could be read. {reasons}".strip())
         map_points = map_file.finish() if map_file else None
         _write_trajectory(out, log, settings)
     finally:
@@ -130,16 +136,53 @@ def run_sequence(
             map_file.close()
     metrics = {
         "scans": len(log),
+        "prediction": "inertial samples" if imu else "constant velocity",
         "scan_ms": {stage: _percentiles(values) for stage, values in stage_ms.items() if values},
         "compile_s": round(step.compile_s, 4),
         "wall_s": round(time.perf_counter() - began, 4),
         "peak_rss_mb": round(peak_rss_mb(), 1),
         "failures": failures,
-        "warnings": [*sequence.warnings_so_far, *overflow.warnings()],
+        "warnings": [
+            *sequence.warnings_so_far,
+            *imu_notes,
+            *(imu.warnings() if imu else ()),
+            *overflow.warnings(),
+        ],
         "overflow": overflow.metrics(),
     }
     write_json(out / "metrics.json", metrics)
     return RunResult(log.trajectory(), metrics, stage_ms, map_points, interruption)
+
+
+def imu_feed(sequence: Sequence, settings: Settings) -> tuple[ImuFeed | None, tuple[str, ...]]:
+    """Return the recording's inertial samples, checked, and what was found wrong with them.
+
+    None where the recording holds none or ``config.imu.use`` is false: the recipe then does without.
+    """
+    if not settings.config.imu.use:
+        return None, ()
+    recorded = sequence.imu()
+    if recorded is None or not len(recorded.stamp_ns):
+        return None, ()
+    imu, found = cleaned(recorded, "IMU", sequence.info.T_imu_lidar)
+    estimated = settings.values["initial"]["time_offset_sigma"] > 0
+    margin = OFFSET_MARGIN_S if estimated else 0.0
+    offset = settings.values["extrinsics"]["time_offset"]
+    return ImuFeed(imu, settings.config.imu.buckets, offset, margin), found
+
+
+def check_start(sequence: Sequence, start: int) -> None:
+    """Refuse a first scan that lies behind the recording's end.
+
+    Raises:
+        UsageError: it does; the sentence says how many scans there are.
+    """
+    info = sequence.info
+    if start >= info.scan_count > 0:
+        raise UsageError(
+            f"{info.path}: holds {info.scan_count} scans, numbered from 0, so none from {start} on; "
+            f"start at {info.scan_count - 1} or before."
+        )
 
 
 def new_map_points(tracked: Tracked) -> NDArray[np.float32]:
@@ -165,7 +208,7 @@ def _write_trajectory(out: Path, log: TrajectoryLog, settings: Settings) -> None
     output = settings.config.output
     chosen = keyframe_indices(trajectory.poses, output.keyframe_distance, output.keyframe_angle)
     poses = trajectory.poses[chosen]
-    write_g2o(out / "keyframes.g2o", poses, odometry_edges(poses, log.column("covariance")[chosen]))
+    write_g2o(out / "keyframes.g2o", poses, odometry_edges(poses, log.match_covariances()[chosen]))
     write_text(out / "config.yaml", settings.to_yaml())
 
 
@@ -187,11 +230,3 @@ def _failure(number: int, tracked: Tracked) -> dict[str, Any]:
 def _percentiles(values: list[float]) -> dict[str, float]:
     median, p95, p99 = np.percentile(values, [50, 95, 99])
     return {"median": round(median, 3), "p95": round(p95, 3), "p99": round(p99, 3)}
-
-
-def _nothing_read(sequence: Sequence, start: int) -> str:
-    info = sequence.info
-    if start >= info.scan_count > 0:
-        return f"{info.path}: has {info.scan_count} scans, so none from --start {start} on."
-    reasons = " ".join(sequence.warnings_so_far)
-    return f"{info.path}: no scan could be read. {reasons}".strip()

@@ -18,6 +18,7 @@ from lio_jax.data.sequence import LidarScan
 from lio_jax.recipes import recipe_named
 from lio_jax.registration.scan_to_map import CONVERGED, ITERATION_LIMIT
 from lio_jax.run.feed import bucket_for, padded
+from lio_jax.run.imu_feed import ImuFeed
 
 
 @dataclass(frozen=True)
@@ -55,19 +56,20 @@ class CompiledStep:
         self._step = jax.jit(partial(recipe.step, self.config), donate_argnums=1)
         self._programs: dict[Any, Any] = {}
 
-    def initial_state(self) -> Any:
-        """Return the recipe's state before the first scan."""
-        return self._run("init", self._init, self.params)
+    def initial_state(self, imu: Any) -> Any:
+        """Return the recipe's state before the first scan; ``imu``: samples up to its end, or None."""
+        return self._run("init", self._init, self.params, imu)
 
-    def restarted(self, state: Any) -> Any:
+    def restarted(self, state: Any, imu: Any) -> Any:
         """Return the state before the first scan, with the velocity that ``state`` found."""
-        return self._run("restart", self._restart, self.params, state)
+        return self._run("restart", self._restart, self.params, state, imu)
 
-    def __call__(self, state: Any, scan: Any) -> tuple[Any, Any]:
+    def __call__(self, state: Any, scan: Any, imu: Any) -> tuple[Any, Any]:
         """Run one step; ``state`` is consumed."""
-        return self._run(scan.points.shape[0], self._step, self.params, state, scan)
+        return self._run("step", self._step, self.params, state, scan, imu)
 
-    def _run(self, key: Any, function: Any, *arguments: Any) -> Any:
+    def _run(self, name: str, function: Any, *arguments: Any) -> Any:
+        key = (name, *(leaf.shape for leaf in jax.tree.leaves(arguments)))
         if key not in self._programs:
             start = time.perf_counter()
             self._programs[key] = function.lower(*arguments).compile()
@@ -76,17 +78,22 @@ class CompiledStep:
 
 
 def track(
-    settings: Settings, scans: Iterable[LidarScan], step: CompiledStep | None = None
+    settings: Settings,
+    scans: Iterable[LidarScan],
+    imu: ImuFeed | None = None,
+    step: CompiledStep | None = None,
 ) -> Iterator[Tracked]:
     """Yield the result of each scan in turn.
 
     Args:
         settings: recipe, config and params.
         scans: in time order.
+        imu: inertial samples; None where there are none or the recipe is to do without.
         step: a compiled step of the same settings, to reuse its programs over several recordings.
     """
     step = step or CompiledStep(settings)
-    state = step.initial_state()
+    state: Any = None
+    before: Any = None
     last_end_ns, last_count, size = None, 0, 0
     opening: list[Any] = []
     for index, scan in enumerate(scans):
@@ -96,13 +103,17 @@ def track(
         if count >= _STRAGGLER * last_count:
             size = bucket_for(count, settings.config.lidar)
         arrays = padded(scan, last_end_ns, settings.config.lidar, size)
+        samples = imu.batch(scan, last_end_ns) if imu else None
         padded_at = time.perf_counter()
         compiled_s = step.compile_s
+        if state is None or (count and not opening):
+            before = imu.before(scan) if imu else None
+            state = step.initial_state(before)
         if len(opening) == 1 and count:
-            state = _reopened(step, state, opening[0], arrays)
+            state = _reopened(step, state, before, opening[0], (arrays, samples))
         if len(opening) < 2 and count:
-            opening.append(arrays)
-        state, output = step(state, arrays)
+            opening.append((arrays, samples))
+        state, output = step(state, arrays, samples)
         nav, result = jax.tree.map(np.array, (state.nav, output.registration))
         lost = bool(output.lost)
         done = time.perf_counter()
@@ -121,16 +132,16 @@ def track(
         )
 
 
-def _reopened(step: CompiledStep, state: Any, first: Any, second: Any) -> Any:
+def _reopened(step: CompiledStep, state: Any, before: Any, first: Any, second: Any) -> Any:
     """Return the state after the first scan, compensated with the velocity that the second one shows.
 
     Only the second scan tells how fast a vehicle is moving from the start; until then the map holds the first
     scan distorted.
     """
-    if first.duration == 0 or first.points.shape != second.points.shape:
+    if first[0].duration == 0 or first[0].points.shape != second[0].points.shape:
         return state
-    trial, _ = step(state, second)
-    return step(step.restarted(trial), first)[0]
+    trial, _ = step(state, *second)
+    return step(step.restarted(trial, before), *first)[0]
 
 
 _STRAGGLER = 0.25
@@ -147,12 +158,12 @@ def pose_matrix(wxyz_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _failure(points: int, result: Any, lost: bool, settings: Settings) -> str:
     if points == 0:
-        return "it holds no points; the pose is the constant-velocity prediction."
+        return "it holds no points; the pose is the prediction."
     if lost:
         needed = settings.values["registration"]["min_matches"]
         return (
             f"{int(result.matches)} points matched the map, {needed:g} are needed; "
-            "the pose is the constant-velocity prediction."
+            "the pose is the prediction."
         )
     if result.status == ITERATION_LIMIT:
         limit = settings.config.registration.max_iterations

@@ -17,29 +17,40 @@ class TrajectoryLog:
 
     def __init__(self) -> None:
         self._rows: list[dict[str, Any]] = []
+        self._matches: list[NDArray[np.float64]] = []
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def append(self, tracked: Tracked) -> None:
         """Keep one result."""
-        nav = tracked.nav
+        nav, state = tracked.nav, tracked.output.covariance
+        match = _covariance(tracked) if self._rows else np.zeros((6, 6))
+        self._matches.append(match)
+        pose = match if state is None else np.asarray(state)[:6, :6]
         self._rows.append(
             {
                 "stamps_ns": np.int64(tracked.stamp_ns),
                 "poses": tracked.T_world_imu,
                 "velocity": nav.velocity,
-                "gyro_bias": nav.gyro_bias,
-                "accel_bias": nav.accel_bias,
+                "biases": np.concatenate([nav.gyro_bias, nav.accel_bias]),
                 "gravity": nav.gravity,
                 "extrinsic": pose_matrix(nav.T_imu_lidar.wxyz_xyz),
-                "covariance": _covariance(tracked) if self._rows else np.zeros((6, 6)),
+                "time_offset": nav.time_offset,
+                "covariance": pose,
+                "nis": np.asarray(tracked.output.nis),
+                "nis_dof": np.asarray(tracked.output.nis_dof),
+                **({} if state is None else {"state_covariance": np.asarray(state)}),
             }
         )
 
     def column(self, name: str) -> NDArray:
         """Return one quantity of all scans, stacked."""
         return np.stack([row[name] for row in self._rows])
+
+    def match_covariances(self) -> NDArray[np.float64]:
+        """Return (n, 6, 6) covariances of the poses by the matches with the map alone."""
+        return np.stack(self._matches)
 
     def trajectory(self) -> Trajectory:
         """Return T_world_imu at the scans' ends."""
@@ -50,10 +61,19 @@ class TrajectoryLog:
         return self.column("poses") @ self.column("extrinsic")
 
     def write_npz(self, path: Path) -> None:
-        """Write every column.
+        """Write every column, one row a scan, at the scans' ends.
 
-        ``covariance`` is that of the pose's right perturbation (rotation rad, position m) by the match with
-        the map alone: zero for the first pose, which is the world's origin, NaN where unknown.
+        - ``stamps_ns`` (n,) int64;
+        - ``poses`` (n, 4, 4) T_world_imu;
+        - ``velocity`` (n, 3) of the IMU origin in world, m/s;
+        - ``biases`` (n, 6) gyroscope rad/s, then accelerometer m/s^2, IMU frame;
+        - ``gravity`` (n, 3) in world, m/s^2;
+        - ``extrinsic`` (n, 4, 4) T_imu_lidar;
+        - ``time_offset`` (n,) s: a scan stamped t was taken at IMU time t + time_offset;
+        - ``covariance`` (n, 6, 6) of the pose's right perturbation (rotation rad, position m): the filter's,
+          in LiDAR odometry that of the match with the map alone, NaN where unknown;
+        - ``state_covariance`` (n, 24, 24) of the whole error state, from filters only;
+        - ``nis``, ``nis_dof`` (n,) normalised innovation squared and its degrees of freedom, 0 without.
         """
         with atomic_path(path) as aside:
             columns: dict[str, Any] = {name: self.column(name) for name in self._rows[0]}

@@ -77,7 +77,7 @@ def test_interrupted_before_the_first_scan(cli, tmp_path, monkeypatch):
     done = cli("run", tmp_path, "--out", tmp_path / "out")
     assert done.status == 1
     assert done.err.splitlines()[-1] == "lio-jax: interrupted before the job was done."
-    assert list((tmp_path / "out").iterdir()) == []
+    assert not (tmp_path / "out").exists()
 
 
 def test_reader_that_fails_in_the_middle(cli, tmp_path, monkeypatch):
@@ -122,7 +122,7 @@ def test_ctrl_c_on_a_real_process(tmp_path, program_cache):
     try:
         deadline = time.monotonic() + 60
         while time.monotonic() < deadline and process.poll() is None:
-            spool = list(out.glob(".map.pcd.*.spool")) if out.is_dir() else []
+            spool = list(out.glob(".map.*.spool")) if out.is_dir() else []
             if spool and spool[0].stat().st_size > 0:
                 time.sleep(0.5)
                 break

@@ -86,10 +86,10 @@ def test_states_have_their_shapes(run):
         "stamps_ns": (COUNT,),
         "poses": (COUNT, 4, 4),
         "velocity": (COUNT, 3),
-        "gyro_bias": (COUNT, 3),
-        "accel_bias": (COUNT, 3),
+        "biases": (COUNT, 6),
         "gravity": (COUNT, 3),
         "extrinsic": (COUNT, 4, 4),
+        "time_offset": (COUNT,),
         "covariance": (COUNT, 6, 6),
     }
     assert states["stamps_ns"].dtype == np.int64

@@ -80,10 +80,22 @@ def test_impossible_part_of_a_recording(folder, cli, tmp_path, words):
     assert not (tmp_path / "out").exists()
 
 
-def test_start_behind_the_end(folder, cli, tmp_path):
-    done = cli("run", folder, "--start", 40, *FAST, "--out", tmp_path / "out")
-    assert done.status == 1
-    assert f"has {COUNT} scans, so none from --start 40 on." in done.err
+@pytest.mark.parametrize("start", [COUNT, 40])
+def test_start_behind_the_end(folder, cli, tmp_path, start):
+    done = cli("run", folder, "--start", start, *FAST, "--out", tmp_path / "out")
+    assert done.status == 2
+    assert done.err == (
+        f"lio-jax: {folder}: holds {COUNT} scans, numbered from 0, so none from {start} on; "
+        f"start at {COUNT - 1} or before.\n"
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_start_behind_the_end_spares_the_earlier_results(folder, cli, tmp_path):
+    (tmp_path / "trajectory.tum").write_text("results of last week\n")
+    done = cli("run", folder, "--start", 40, *FAST, "--out", tmp_path, "--overwrite")
+    assert done.status == 2
+    assert (tmp_path / "trajectory.tum").read_text() == "results of last week\n"
 
 
 @pytest.mark.parametrize("kind", ["file", "run folder", "recording"])

@@ -34,4 +34,4 @@ def step(settings: Settings) -> CompiledStep:
 
 @pytest.fixture(scope="session")
 def tracked(settings: Settings, step: CompiledStep) -> list[Tracked]:
-    return list(track(settings, small_drive.moving(), step))
+    return list(track(settings, small_drive.moving(), step=step))

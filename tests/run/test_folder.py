@@ -1,45 +1,113 @@
 """The run folder is never overwritten by accident."""
 
 import json
+import signal
+import subprocess
+import sys
 
 import pytest
 
 from lio_jax.core.errors import UsageError
-from lio_jax.run.folder import prepare_folder, write_json
+from lio_jax.run.folder import RUN_FILES, run_folder, write_json
 
 
 def test_makes_the_folder_and_its_parents(tmp_path):
-    prepare_folder(tmp_path / "a" / "b", overwrite=False)
-    assert (tmp_path / "a" / "b").is_dir()
+    with run_folder(tmp_path / "a" / "b", overwrite=False):
+        (tmp_path / "a" / "b" / "trajectory.tum").touch()
+    assert (tmp_path / "a" / "b" / "trajectory.tum").exists()
 
 
-def test_takes_an_empty_folder(tmp_path):
-    prepare_folder(tmp_path, overwrite=False)
+def test_takes_an_empty_folder_and_leaves_it_there(tmp_path):
+    with run_folder(tmp_path, overwrite=False):
+        pass
+    assert tmp_path.is_dir()
+
+
+def fail_in(folder):
+    with run_folder(folder, overwrite=False):
+        assert folder.is_dir()
+        raise KeyboardInterrupt
+
+
+def test_a_folder_that_got_no_results_is_removed(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        fail_in(tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_refuses_a_folder_that_holds_something(tmp_path):
     (tmp_path / "thesis.tex").touch()
-    with pytest.raises(UsageError, match=r"not empty; choose another folder or add --overwrite"):
-        prepare_folder(tmp_path, overwrite=False)
+    with (
+        pytest.raises(UsageError, match=r"not empty; choose another folder or add --overwrite"),
+        run_folder(tmp_path, overwrite=False),
+    ):
+        pass
+    assert (tmp_path / "thesis.tex").exists()
 
 
 def test_overwriting_removes_results_and_nothing_else(tmp_path):
     for name in ("thesis.tex", "trajectory.tum", "recording.rrd"):
         (tmp_path / name).touch()
-    prepare_folder(tmp_path, overwrite=True)
-    assert [entry.name for entry in tmp_path.iterdir()] == ["thesis.tex"]
+    with run_folder(tmp_path, overwrite=True):
+        assert [entry.name for entry in tmp_path.iterdir()] == ["thesis.tex"]
 
 
 def test_refuses_a_file_even_if_it_may_overwrite(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match=r"file: is a file"):
-        prepare_folder(tmp_path / "file", overwrite=True)
+    with pytest.raises(UsageError, match=r"file: is a file"), run_folder(tmp_path / "file", overwrite=True):
+        pass
 
 
 def test_folder_below_a_file_cannot_be_made(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match=r"cannot be made \(Not a directory\)"):
-        prepare_folder(tmp_path / "file" / "run", overwrite=False)
+    with (
+        pytest.raises(UsageError, match=r"cannot be made \(Not a directory\)"),
+        run_folder(tmp_path / "file" / "run", overwrite=False),
+    ):
+        pass
+
+
+def test_refuses_a_folder_that_another_run_holds(tmp_path):
+    with run_folder(tmp_path, overwrite=False):
+        (tmp_path / ".map.0123abcd.pcd").touch()
+        with pytest.raises(UsageError, match=r"another run is writing there"), run_folder(tmp_path, True):
+            pass
+        assert (tmp_path / ".map.0123abcd.pcd").exists()
+
+
+WRITES_AND_IS_KILLED = """
+import os, signal, sys
+from pathlib import Path
+import numpy as np
+from lio_jax.core.files import atomic_path
+from lio_jax.run.folder import RUN_FILES, run_folder
+from lio_jax.run.map_file import MapFile
+
+out = Path(sys.argv[1])
+with run_folder(out, False):
+    MapFile(out / "map.pcd").append(np.zeros((1000, 3), np.float32))
+    for name in RUN_FILES:
+        atomic_path(out / name).__enter__().write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_run_left_behind_is_removed(tmp_path):
+    out = tmp_path / "out"
+    killed = subprocess.run([sys.executable, "-c", WRITES_AND_IS_KILLED, out], timeout=60)
+    assert killed.returncode == -signal.SIGKILL
+    left = sorted(entry.name for entry in out.iterdir())
+    assert len(left) == len(RUN_FILES) + 1
+    assert all(name.startswith(".") for name in left)
+    with run_folder(out, overwrite=False):
+        assert list(out.iterdir()) == []
+
+
+def test_other_hidden_files_are_nobody_s_leftovers(tmp_path):
+    for name in (".git", ".map.pcd", ".map.0123abcg.pcd", ".map.0123abcd.npz", ".trajectory.old.tum"):
+        (tmp_path / name).touch()
+    with run_folder(tmp_path, overwrite=True):
+        assert len(list(tmp_path.iterdir())) == 5
 
 
 def test_json_holds_no_nan_and_leaves_no_half_file(tmp_path):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lio_jax.core.errors import LioJaxError
+from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.core.settings import with_overrides
 from lio_jax.data.trajectory import read_tum
 from lio_jax.run.run import run_sequence, settings_for
@@ -90,7 +90,9 @@ def test_recording_without_a_readable_scan_says_why(tmp_path, settings):
 
 
 def test_start_behind_the_end_says_how_many_scans_there_are(tmp_path, settings):
-    with pytest.raises(LioJaxError, match=rf"memory: has {COUNT} scans, so none from --start 99 on"):
+    with pytest.raises(
+        UsageError, match=rf"memory: holds {COUNT} scans, numbered from 0, so none from 99 on"
+    ):
         run_sequence(Replay(moving()), settings, tmp_path, start=99)
 
 

@@ -1,0 +1,232 @@
+"""Tightly coupled LiDAR-inertial odometry: an iterated error-state filter on voxel planes.
+
+scan -> thin --------> deskew -> iterated update (match, linearise) -> insert -> map
+imu  -> propagate --/------------/
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Float32, Int32
+
+from lio_jax.core.config import Config
+from lio_jax.core.error_state import Uncertain
+from lio_jax.core.params import Params
+from lio_jax.core.types import ImuBatch, NavState, Scan
+from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement, Update
+from lio_jax.estimation.nav_update import update_nav
+from lio_jax.estimation.pose_measurement import keep_observed, lidar_pose_jacobian
+from lio_jax.imu.initialise import initialise_at_rest
+from lio_jax.imu.path import Path, deskew_along
+from lio_jax.imu.strapdown import propagate
+from lio_jax.lidar.thinning import thinned
+from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
+from lio_jax.recipes.output import Output
+from lio_jax.registration.scan_to_map import (
+    Association,
+    Frame,
+    NormalEquations,
+    Registration,
+    associated,
+    linearise,
+    no_association,
+)
+
+
+class State(eqx.Module):
+    """What is carried from scan to scan."""
+
+    uncertain: Uncertain
+    """Navigation state at the last scan's end, and its covariance."""
+    prediction_error: Float[Array, ""]
+    """Expected error of the next prediction, m: it opens the robust kernel."""
+    scans: Int32[Array, ""]
+    """Scans with points seen so far."""
+    map: VoxelMap
+
+    @property
+    def nav(self) -> NavState:
+        """The navigation state."""
+        return self.uncertain.nav
+
+
+def init(config: Config, params: Params, imu: ImuBatch, velocity: Float[Array, "3"] | None = None) -> State:
+    """Return the state before the first scan: at the world's origin, levelled by the samples.
+
+    Args:
+        config: static.
+        params: traced.
+        imu: samples of about a second up to the first scan's end.
+        velocity: in world, m/s, where it is known; None: that of a vehicle at rest.
+    """
+    start = initialise_at_rest(
+        imu,
+        params.imu,
+        params.initial,
+        params.extrinsics.T_imu_lidar(),
+        params.extrinsics.time_offset,
+    )
+    uncertain = start.start
+    if velocity is not None:
+        moving = jnp.where(start.is_still, uncertain.nav.velocity, velocity)
+        uncertain = Uncertain(dataclasses.replace(uncertain.nav, velocity=moving), uncertain.covariance)
+    return State(
+        uncertain=uncertain,
+        prediction_error=jnp.asarray(params.motion.initial_error, uncertain.covariance.dtype),
+        scans=jnp.int32(0),
+        map=empty_map(config.map.capacity),
+    )
+
+
+def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch) -> tuple[State, Output]:
+    """Predict by the inertial samples, correct by the scan, add the scan to the map.
+
+    Args:
+        config: static.
+        params: traced.
+        state: donate it.
+        scan: padded sweep; ``scan.interval`` is the time since the last scan's end.
+        imu: samples around that time.
+    """
+    first = state.scans == 0
+    thin = thinned(config, params, scan)
+    with jax.named_scope("predict"):
+        prior, path = _predicted(params, state.uncertain, scan, imu, first)
+        T_predicted = _lidar_pose(prior.nav)
+        points = deskew_along(path, prior.nav.T_imu_lidar, thin.points, thin.time)
+    with jax.named_scope("update"):
+        frame = Frame(*anchor_of(T_predicted.translation(), params.map.voxel_size))
+        scan_match = _ScanMatch(
+            state.map, points[thin.matched.index], thin.matched.mask, frame, state.prediction_error, params
+        )
+        update = update_nav(
+            prior,
+            scan_match.measure,
+            max_iterations=config.registration.max_iterations,
+            rotation_tolerance=params.registration.rotation_tolerance,
+            translation_tolerance=params.registration.translation_tolerance,
+            first_aux=scan_match.before(T_predicted),
+        )
+        posterior: Uncertain = update.state
+        lost = (update.status > ITERATION_LIMIT) & ~first
+        T_world_lidar = _lidar_pose(posterior.nav)
+        missed = jnp.linalg.norm((T_predicted.inverse() @ T_world_lidar).translation())
+        error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
+    with jax.named_scope("insert"):
+        _, placed = frame.place(points, T_world_lidar)
+        vmap, added = insert(
+            state.map,
+            placed,
+            thin.mask & ~lost,
+            frame.anchor,
+            params.map.voxel_size.astype(jnp.float32),
+            params.map.reach.astype(jnp.float32),
+        )
+
+    new_state = State(
+        uncertain=posterior,
+        prediction_error=jnp.where(first | lost, state.prediction_error, error),
+        scans=state.scans + jnp.any(thin.mask).astype(jnp.int32),
+        map=vmap,
+    )
+    return new_state, Output(
+        registration=_registration(update, T_world_lidar),
+        lost=lost,
+        nis=update.innovation.nis,
+        nis_dof=update.innovation.dof,
+        points=placed,
+        points_mask=thin.mask,
+        added=added.added,
+        origin=frame.origin,
+        thinned_away=thin.dropped,
+        map_dropped=added.dropped,
+        covariance=posterior.covariance,
+    )
+
+
+def _predicted(
+    params: Params, last: Uncertain, scan: Scan, imu: ImuBatch, first: Bool[Array, ""]
+) -> tuple[Uncertain, Path]:
+    """Return the state at the scan's end and the motion since the last scan's end."""
+    dtype = last.covariance.dtype
+    end = scan.duration.astype(dtype)
+    start = jnp.where(first, 0.0, end - scan.interval.astype(dtype))
+    moved, path = propagate(last, imu, params.imu, start, end)
+    # the first scan's end is the world's origin: its samples only deskew it
+    return jax.tree.map(lambda new, old: jnp.where(first, old, new), moved, last), path
+
+
+def _lidar_pose(nav: NavState) -> jaxlie.SE3:
+    return jaxlie.SE3((nav.T_world_imu @ nav.T_imu_lidar).wxyz_xyz)
+
+
+class _Trial(eqx.Module):
+    """What one linearisation leaves to the next."""
+
+    association: Association
+    iteration: Int32[Array, ""]
+    equations: NormalEquations
+    degenerate: Bool[Array, " 6"]
+
+
+class _ScanMatch(eqx.Module):
+    """The scan against the map, as a measurement of the navigation state."""
+
+    map: VoxelMap
+    points: Float32[Array, "k 3"]
+    mask: Bool[Array, " k"]
+    frame: Frame
+    prediction_error: Float[Array, ""]
+    params: Params
+
+    def before(self, T_world_lidar: jaxlie.SE3) -> _Trial:
+        """Return what the first linearisation starts from."""
+        zero = jnp.zeros((), T_world_lidar.wxyz_xyz.dtype)
+        nothing = NormalEquations(jnp.zeros((6, 6)), jnp.zeros(6), jnp.int32(0), zero, zero, zero)
+        return _Trial(
+            no_association(self.mask, T_world_lidar), jnp.int32(0), nothing, jnp.zeros(6, jnp.bool_)
+        )
+
+    def measure(self, nav: NavState, last: _Trial) -> Measurement:
+        """Match and linearise at ``nav``; the kernel opens and narrows as in :func:`register`."""
+        settings = self.params.registration
+        T = _lidar_pose(nav)
+        opening = self.prediction_error * 0.5 ** last.iteration.astype(self.prediction_error.dtype)
+        association = associated(
+            last.association, self.map, self.points, self.mask, T, self.frame, self.params
+        )
+        equations = linearise(
+            association.matches, self.points, T, self.frame, settings.kernel + opening, self.params
+        )
+        information, gradient, degenerate = keep_observed(
+            equations.hessian, equations.gradient, equations.arm_squared, settings.degeneracy_ratio
+        )
+        return Measurement(
+            information=settings.information_scale * information,
+            gradient=settings.information_scale * gradient,
+            jacobian=lidar_pose_jacobian(nav),
+            lost=equations.matches < settings.min_matches,
+            aux=_Trial(association, last.iteration + 1, equations, degenerate),
+            settled=opening < settings.kernel,
+        )
+
+
+def _registration(update: Update, T_world_lidar: jaxlie.SE3) -> Registration:
+    """Return the update in the terms of a scan-to-map solve."""
+    trial: _Trial = update.measurement.aux
+    equations = trial.equations
+    to_body = jax.scipy.linalg.block_diag(*[T_world_lidar.rotation().as_matrix()] * 2)
+    return Registration(
+        T_world_lidar=T_world_lidar,
+        information=to_body.T @ update.measurement.information @ to_body,
+        degenerate=trial.degenerate,
+        matches=equations.matches,
+        rmse=jnp.sqrt(
+            equations.squared_error / jnp.maximum(equations.weight, jnp.finfo(equations.weight.dtype).tiny)
+        ),
+        iterations=update.iterations,
+        status=update.status,
+    )

@@ -1,0 +1,162 @@
+"""LiDAR odometry without inertial data: constant velocity, voxel distributions, robust Gauss-Newton.
+
+scan -> thin -> predict -> register (deskewing under trial) -> deskew -> insert -> map
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float, Int32
+
+from lio_jax.core.config import Config
+from lio_jax.core.params import Params
+from lio_jax.core.types import NavState, Scan, initial_nav_state
+from lio_jax.lidar.deskew import deskew_constant_velocity
+from lio_jax.lidar.thinning import thinned
+from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
+from lio_jax.recipes.output import Output
+from lio_jax.registration.scan_to_map import TOO_FEW_MATCHES, register
+
+
+class State(eqx.Module):
+    """What is carried from scan to scan."""
+
+    nav: NavState
+    """At the last scan's end."""
+    T_world_lidar: jaxlie.SE3
+    """At the middle of the last scan: the instant registration solves for, where deskewing errs least."""
+    mid_to_end: Float[Array, ""]
+    """From that instant to the scan's end, s."""
+    twist: Float[Array, "6"]
+    """Velocity of the lidar in its own frame, m/s then rad/s."""
+    prediction_error: Float[Array, ""]
+    """Expected error of the next prediction, m."""
+    scans: Int32[Array, ""]
+    """Scans with points seen so far."""
+    map: VoxelMap
+
+
+def init(config: Config, params: Params, twist: Float[Array, "6"] | None = None) -> State:
+    """Return the state before the first scan: at the world's origin, with an empty map.
+
+    Args:
+        config: static.
+        params: traced.
+        twist: velocity of the lidar in its own frame, m/s then rad/s; None: at rest.
+    """
+    nav = initial_nav_state(params.extrinsics.T_imu_lidar())
+    dtype = nav.velocity.dtype
+    return State(
+        nav=nav,
+        T_world_lidar=nav.T_world_imu @ nav.T_imu_lidar,
+        mid_to_end=jnp.zeros((), dtype),
+        twist=jnp.zeros(6, dtype) if twist is None else twist,
+        prediction_error=jnp.asarray(params.motion.initial_error, dtype),
+        scans=jnp.int32(0),
+        map=empty_map(config.map.capacity),
+    )
+
+
+def restart(config: Config, params: Params, state: State) -> State:
+    """Return the state before the first scan once more, now with the velocity that ``state`` found.
+
+    A vehicle that is already moving distorts its first scan, which nothing can compensate until the second.
+    """
+    return init(config, params, state.twist)
+
+
+def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[State, Output]:
+    """Register one scan and add it to the map.
+
+    Velocity is taken as constant from the middle of the last scan to the middle of this one, and is solved
+    for together with the pose: each trial pose deskews the scan with the velocity it implies.
+
+    Args:
+        config: static.
+        params: traced.
+        state: donate it.
+        scan: padded sweep; ``scan.interval`` is the time since the last scan's end.
+    """
+    with jax.named_scope("thin"):
+        thin = thinned(config, params, scan)
+        delay = thin.time - 0.5 * scan.duration
+        matched = thin.matched
+    with jax.named_scope("predict"):
+        middle = 0.5 * scan.duration.astype(state.twist.dtype)
+        first = state.scans == 0
+        # the first scan's end is the world's origin, however many empty scans went before
+        interval = jnp.where(first, 0.0, scan.interval.astype(state.twist.dtype))
+        elapsed = state.mid_to_end + interval - middle
+        prediction = state.T_world_lidar @ jaxlie.SE3.exp(elapsed * state.twist)
+        T_last_inverse = state.T_world_lidar.inverse()
+
+        def twist_to(T_world_lidar: jaxlie.SE3) -> Array:
+            moved = (T_last_inverse @ T_world_lidar).log()
+            known = ~first & (elapsed > 0)
+            return jnp.where(known, moved / jnp.where(known, elapsed, 1.0), state.twist)
+
+    with jax.named_scope("register"):
+        result = register(
+            state.map,
+            lambda T: deskew_constant_velocity(thin.points[matched.index], delay[matched.index], twist_to(T)),
+            matched.mask,
+            prediction,
+            state.prediction_error,
+            params,
+            config.registration.max_iterations,
+        )
+        lost = (result.status == TOO_FEW_MATCHES) & ~first
+        twist = jnp.where(lost, state.twist, twist_to(result.T_world_lidar))
+        missed = jnp.linalg.norm((prediction.inverse() @ result.T_world_lidar).translation())
+        error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
+        error = jnp.where(first | lost, state.prediction_error, error)
+    with jax.named_scope("insert"):
+        T = result.T_world_lidar
+        anchor, corner = anchor_of(T.translation(), params.map.voxel_size)
+        shift = (T.translation() - corner).astype(jnp.float32)
+        deskewed = deskew_constant_velocity(thin.points, delay, twist)
+        anchored = deskewed @ T.rotation().as_matrix().astype(jnp.float32).T + shift
+        vmap, added = insert(
+            state.map,
+            anchored,
+            thin.mask & ~lost,
+            anchor,
+            params.map.voxel_size.astype(jnp.float32),
+            params.map.reach.astype(jnp.float32),
+        )
+
+    T_world_imu = T @ jaxlie.SE3.exp(middle * twist) @ params.extrinsics.T_imu_lidar().inverse()
+    nav = eqx.tree_at(
+        lambda nav: (nav.T_world_imu, nav.velocity),
+        state.nav,
+        (jaxlie.SE3(T_world_imu.wxyz_xyz), _imu_velocity(T_world_imu, twist, params)),
+    )
+    seen = jnp.any(thin.mask)
+    new_state = State(
+        nav=nav,
+        T_world_lidar=T,
+        mid_to_end=middle,
+        twist=twist,
+        prediction_error=error,
+        scans=state.scans + seen.astype(jnp.int32),
+        map=vmap,
+    )
+    return new_state, Output(
+        registration=result,
+        lost=lost,
+        nis=jnp.zeros_like(error),
+        nis_dof=jnp.int32(0),
+        points=anchored,
+        points_mask=thin.mask,
+        added=added.added,
+        origin=corner,
+        thinned_away=thin.dropped,
+        map_dropped=added.dropped,
+    )
+
+
+def _imu_velocity(T_world_imu: jaxlie.SE3, twist: Float[Array, "6"], params: Params) -> Float[Array, "3"]:
+    """Return the IMU origin's velocity in world from the lidar's twist in its own frame."""
+    in_imu = params.extrinsics.T_imu_lidar().adjoint() @ twist
+    return T_world_imu.rotation() @ in_imu[:3]

@@ -1,0 +1,31 @@
+"""What every recipe's step reports beside its state."""
+
+import equinox as eqx
+from jaxtyping import Array, Bool, Float, Float32, Int32
+
+from lio_jax.registration.scan_to_map import Registration
+
+
+class Output(eqx.Module):
+    """Of one scan."""
+
+    registration: Registration
+    lost: Bool[Array, ""]
+    """The scan could not be matched; the pose is the prediction and the map was left alone."""
+    nis: Float[Array, ""]
+    """Normalised innovation squared of the match against the prediction; 0 where there was none."""
+    nis_dof: Int32[Array, ""]
+    """Its degrees of freedom: the directions the match observed."""
+    points: Float32[Array, "m 3"]
+    """The thinned scan, motion compensated, in world axes from ``origin``, m."""
+    points_mask: Bool[Array, " m"]
+    added: Bool[Array, " m"]
+    """Which of ``points`` were new to the map."""
+    origin: Float[Array, "3"]
+    """Where ``points`` count from, m in world."""
+    thinned_away: Int32[Array, ""]
+    """Occupied cells of the scan beyond its capacities: they thin the scan further, evenly."""
+    map_dropped: Int32[Array, ""]
+    """Points whose voxel found no room in the map."""
+    covariance: Float[Array, "24 24"] | None = None
+    """Of the navigation state's error; None from recipes that carry none."""
