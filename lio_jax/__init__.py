@@ -14,8 +14,11 @@ if TYPE_CHECKING:
     from lio_jax.core.settings import Settings, load_settings, with_overrides
     from lio_jax.data import LidarScan, Sequence, Trajectory, open_sequence
     from lio_jax.evaluation.evaluate import evaluate
-    from lio_jax.run.run import RunResult, run_sequence, settings_for
+    from lio_jax.run.run import RunResult, imu_feed, run_sequence, settings_for
     from lio_jax.run.track import CompiledStep, Tracked, track
+    from lio_jax.sim.gps import GpsModel
+    from lio_jax.sim.imu import ImuModel
+    from lio_jax.sim.sequence import SimulatedSequence
 
 _HOMES = {
     "Config": "core.config",
@@ -32,27 +35,35 @@ _HOMES = {
     "open_sequence": "data",
     "evaluate": "evaluation.evaluate",
     "RunResult": "run.run",
+    "imu_feed": "run.run",
     "run_sequence": "run.run",
     "settings_for": "run.run",
     "CompiledStep": "run.track",
     "Tracked": "run.track",
     "track": "run.track",
+    "GpsModel": "sim.gps",
+    "ImuModel": "sim.imu",
+    "SimulatedSequence": "sim.sequence",
 }
 
 __all__ = [
     "CompiledStep",
     "Config",
+    "GpsModel",
+    "ImuModel",
     "LidarScan",
     "LioJaxError",
     "Params",
     "RunResult",
     "Sequence",
     "Settings",
+    "SimulatedSequence",
     "Tracked",
     "Trajectory",
     "UsageError",
     "default_params",
     "evaluate",
+    "imu_feed",
     "load_settings",
     "open_sequence",
     "run_sequence",

@@ -9,32 +9,56 @@ import numpy as np
 from numpy.typing import NDArray
 from systems import Pose
 
-from lio_jax.core.settings import Settings, with_extrinsics, with_overrides
-from lio_jax.data.sequence import LidarScan
+from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
+from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.run.feed import bucket_for
+from lio_jax.run.run import imu_feed
 from lio_jax.run.track import CompiledStep, track
+
+_OPENING = 3
+"""Scans in which every program of a drive has been compiled once: init, restart, step."""
 
 
 class LioJaxSystem:
-    """The default recipe; padding, transfer, the step and the result's way back to the host are timed."""
+    """A recipe; padding, transfer, the step and the result's way back to the host are timed."""
 
     name: ClassVar[str] = "lio_jax"
     instant: ClassVar[float] = 1.0
     instant_reason: ClassVar[str] = "states live at the scan's end"
 
-    def __init__(self, threads: int, T_imu_lidar: NDArray[np.float64], overrides: tuple[str, ...]) -> None:
+    def __init__(
+        self,
+        threads: int,
+        T_imu_lidar: NDArray[np.float64],
+        overrides: tuple[str, ...],
+        inertial: Sequence | None = None,
+        recipe: str = "default",
+    ) -> None:
+        """Make a system that has seen no scan.
+
+        Args:
+            threads: for the interface's sake.
+            T_imu_lidar: (4, 4).
+            overrides: ``path=value`` settings.
+            inertial: recording whose inertial samples to use; None: LiDAR only.
+            recipe: its own settings hold where ``overrides`` say nothing.
+        """
         # XLA takes the cores that the process may run on: the script limits those to ``threads``
         jax.config.update("jax_enable_x64", True)
         self._T_imu_lidar = T_imu_lidar
-        settings, step = _compiled(T_imu_lidar.tobytes(), overrides)
+        settings, step = _compiled(T_imu_lidar.tobytes(), recipe, overrides)
         self._config = settings.config.lidar
         self._pending: LidarScan
-        self._results = track(settings, self._feed(), step=step)
+        imu = imu_feed(inertial, settings)[0] if inertial is not None else None
+        self._results = track(settings, self._feed(), imu, step)
 
     def warm_up(self, scans: list[LidarScan]) -> None:
-        by_bucket = {bucket_for(len(scan.points), self._config): scan for scan in reversed(scans)}
-        for scan in [scans[0], *by_bucket.values()]:
-            self.register(self.prepare(scan))
+        sizes: set[int] = set()
+        for number, scan in enumerate(scans):
+            size = bucket_for(len(scan.points), self._config)
+            if number < _OPENING or size not in sizes:
+                self.register(self.prepare(scan))
+            sizes.add(size)
 
     def prepare(self, scan: LidarScan) -> LidarScan:
         return scan
@@ -50,8 +74,8 @@ class LioJaxSystem:
 
 
 @cache
-def _compiled(T_imu_lidar: bytes, overrides: tuple[str, ...]) -> tuple[Settings, CompiledStep]:
+def _compiled(T_imu_lidar: bytes, recipe: str, overrides: tuple[str, ...]) -> tuple[Settings, CompiledStep]:
     """Return settings and the step that every pass over a recording shares, so that it is compiled once."""
     matrix = np.frombuffer(T_imu_lidar, np.float64).reshape(4, 4)
-    settings = with_overrides(with_extrinsics(Settings(), matrix, "recording"), overrides)
+    settings = with_overrides(with_extrinsics(recipe_settings(recipe), matrix, "recording"), overrides)
     return settings, CompiledStep(settings)

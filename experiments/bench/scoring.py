@@ -14,6 +14,9 @@ from lio_jax.evaluation.trajectory_error import absolute_error, relative_error
 _WINDOWS = (1, 10)
 """Scans between the two poses of a pair, against an INS."""
 
+_LOST_WINDOW_NS, _LOST_M, _LOST_DEG = 1_000_000_000, 0.5, 10.0
+"""Track counts as lost when the motion over this time is wrong by more than either."""
+
 
 @dataclass(frozen=True)
 class Reference:
@@ -45,6 +48,32 @@ def score(estimate: Trajectory, reference: Reference) -> dict[str, float]:
         if window < len(matched):
             errors |= _window_errors(matched.estimate, matched.reference, window)
     return errors
+
+
+def lost_after(estimate: Trajectory, reference: Trajectory) -> float | None:
+    """Return after how many seconds the motion over a second is first badly wrong, or None if it never is.
+
+    Slow drift is not a loss of track; standing still while the vehicle drives on, or diverging, is.
+
+    Args:
+        estimate: stamped with the instants its poses refer to, ascending.
+        reference: of the same body.
+    """
+    matched = match_by_time(estimate, reference)
+    stamps = matched.estimate.stamp_ns
+    # the pose about a second before each; those of the first second have none
+    before = np.searchsorted(stamps, stamps - _LOST_WINDOW_NS, "right") - 1
+    after = np.flatnonzero(before >= 0)
+    before = before[after]
+    ours, true = (
+        np.linalg.inv(trajectory.poses[before]) @ trajectory.poses[after]
+        for trajectory in (matched.estimate, matched.reference)
+    )
+    error = np.linalg.inv(true) @ ours
+    wrong = (np.linalg.norm(error[:, :3, 3], axis=1) > _LOST_M) | (_angles_deg(error) > _LOST_DEG)
+    if not wrong.any():
+        return None
+    return float(stamps[after[wrong.argmax()]] - stamps[0]) * 1e-9
 
 
 def _pose_errors(estimate: Trajectory, reference: Trajectory) -> dict[str, float]:

@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from lio_jax.commands.runtime import say
 from lio_jax.core.errors import LioJaxError, UsageError
-from lio_jax.core.settings import Settings, load_settings, with_overrides
+from lio_jax.core.settings import Settings, load_settings, recipe_settings, with_overrides
 from lio_jax.data.open import open_sequence
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory
@@ -27,7 +27,7 @@ def resolve_settings(recipe: str, assignments: tuple[str, ...]) -> Settings:
         UsageError: unknown recipe, unreadable file, unknown key or impossible value.
     """
     is_file = recipe.endswith((".yaml", ".yml"))
-    settings = load_settings(Path(recipe)) if is_file else Settings(recipe=recipe)
+    settings = load_settings(Path(recipe)) if is_file else recipe_settings(recipe)
     recipe_named(settings.recipe)
     return with_overrides(settings, assignments)
 

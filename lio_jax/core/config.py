@@ -59,6 +59,10 @@ class ImuConfig:
     """Couple the recording's inertial samples in; false: LiDAR odometry."""
     buckets: tuple[int, ...] = (32, 64, 128, 256, 512, 1024, 2048)
     """Padded numbers of samples between two scans; more than the last are thinned to it."""
+    registration_points: int = 2048
+    """Takes the place of ``config.lidar.registration_points``: with inertial samples fewer points will do."""
+    insertion_points: int = 8192
+    """Takes the place of ``config.lidar.insertion_points``."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,23 @@ class RegistrationConfig:
 
     max_iterations: int = 60
     """Gauss-Newton steps at most."""
+
+
+@dataclass(frozen=True)
+class KnnConfig:
+    """Matching by nearest neighbours."""
+
+    neighbours: int = 5
+    """Map points through which a plane is fitted."""
+
+
+@dataclass(frozen=True)
+class FastLio2Config:
+    """What the recipe fast_lio2 has of its own."""
+
+    point_filter_num: int = 3
+    """Every how many points of a scan one is used, counted in the recording's order: a divisor of the beams'
+    number would leave whole beams out where the points of a firing follow each other."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +123,8 @@ class Config:
     imu: ImuConfig = field(default_factory=ImuConfig)
     map: MapConfig = field(default_factory=MapConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    knn: KnnConfig = field(default_factory=KnnConfig)
+    fast_lio2: FastLio2Config = field(default_factory=FastLio2Config)
     output: OutputConfig = field(default_factory=OutputConfig)
 
 
@@ -112,6 +135,8 @@ def invalid_config(path: str, value: object) -> str:
     """Return why a setting's value is impossible ("must be ..."), or nothing if it is possible."""
     if path == "config.map.capacity" and (not isinstance(value, int) or value < 2 or value & (value - 1)):
         return "must be a power of two"
+    if path == "config.knn.neighbours" and isinstance(value, int) and value < 3:
+        return "must be at least 3: fewer points define no plane"
     if path.endswith(".buckets") and (sorted(set(value)) != list(value) or value[0] < 1):  # type: ignore
         return "must be positive sizes in ascending order"
     if path == "config.data.vertical_correction_deg":

@@ -37,15 +37,16 @@ class InitialParams(eqx.Module):
     """Standard deviations of the first navigation state; zero freezes that part of the state."""
 
     rotation_sigma: Scalar
-    """Of roll and pitch, rad; the world's heading is the first pose's."""
+    """Of roll and pitch, rad. Zero, because the first scan's map is as tilted as the first pose: what is
+    unknown is where gravity points in that world."""
     velocity_sigma: Scalar
-    """m/s."""
+    """m/s. Wide, because inertial samples can't tell rest from constant velocity; the second scan can."""
     gyro_bias_sigma: Scalar
     """rad/s."""
     accel_bias_sigma: Scalar
     """m/s^2."""
     gravity_sigma: Scalar
-    """Of gravity's direction, rad."""
+    """Of gravity's direction in the world that the first pose defines, before the samples at rest, rad."""
     extrinsic_rotation_sigma: Scalar
     """Of T_imu_lidar's rotation, rad."""
     extrinsic_translation_sigma: Scalar
@@ -101,6 +102,31 @@ class RegistrationParams(eqx.Module):
     """Matched points below which a scan counts as lost."""
 
 
+class KnnParams(eqx.Module):
+    """Planes through a point's nearest neighbours in the map."""
+
+    radius: Scalar
+    """The farthest neighbour has to be nearer than this, m."""
+    plane_tolerance: Scalar
+    """All neighbours have to be within this distance of their plane, m."""
+    distance_weight: Scalar
+    """w of a match's score 1 - w |d| / sqrt(r): d its distance from the plane, r its range, m."""
+    min_score: Scalar
+    """A match counts if its score is larger than this."""
+
+
+class PointMapParams(eqx.Module):
+    """A map of one point per voxel, inside a cube that follows the sensor."""
+
+    cube_side_length: Scalar
+    """Outside of the cube nothing is kept, m."""
+    cube_margin: Scalar
+    """The cube moves when the sensor is nearer to a face than this many times ``lidar.max_range``."""
+    nearer_by: Scalar
+    """A point takes its voxel over if it is nearer to the centre than the one there by more than this, m.
+    Within the range noise that of the luckiest noise would stay: surfaces would lean to the centres."""
+
+
 class MotionParams(eqx.Module):
     """The constant-velocity prediction between scans."""
 
@@ -108,6 +134,19 @@ class MotionParams(eqx.Module):
     """How far off the prediction may be before any velocity is known, m: it opens the robust kernel."""
     error_decay: Scalar
     """Share of the last expected prediction error kept when predictions turn out better, 0 to 1."""
+
+
+class LimitParams(eqx.Module):
+    """What is reported as a failure when it is exceeded."""
+
+    speed: Scalar
+    """m/s."""
+    gyro_bias: Scalar
+    """rad/s."""
+    accel_bias: Scalar
+    """m/s^2."""
+    outage: Scalar
+    """Time between two scans, s."""
 
 
 class ExtrinsicsParams(eqx.Module):
@@ -135,7 +174,10 @@ class Params(eqx.Module):
     lidar: LidarParams
     map: MapParams
     registration: RegistrationParams
+    knn: KnnParams
+    point_map: PointMapParams
     motion: MotionParams
+    limits: LimitParams
     extrinsics: ExtrinsicsParams
 
 
@@ -148,11 +190,11 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "gravity": 9.80665,
     },
     "initial": {
-        "rotation_sigma": 0.02,
-        "velocity_sigma": 0.1,
+        "rotation_sigma": 0.0,
+        "velocity_sigma": 10.0,
         "gyro_bias_sigma": 0.01,
         "accel_bias_sigma": 0.1,
-        "gravity_sigma": 0.0,
+        "gravity_sigma": 0.1,
         "extrinsic_rotation_sigma": 0.0,
         "extrinsic_translation_sigma": 0.0,
         "time_offset_sigma": 0.0,
@@ -169,7 +211,10 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "degeneracy_ratio": 0.01,
         "min_matches": 50.0,
     },
+    "knn": {"radius": 5**0.5, "plane_tolerance": 0.1, "distance_weight": 0.9, "min_score": 0.9},
+    "point_map": {"cube_side_length": 1000.0, "cube_margin": 1.5, "nearer_by": 0.1},
     "motion": {"initial_error": 2.0, "error_decay": 0.5},
+    "limits": {"speed": 30.0, "gyro_bias": 1.0, "accel_bias": 1.0, "outage": 1.0},
     "extrinsics": {"rotation": [0.0, 0.0, 0.0, 1.0], "translation": [0.0, 0.0, 0.0], "time_offset": 0.0},
 }
 """Values of the default recipe in the units of the leaves above."""
@@ -210,11 +255,20 @@ _MAY_BE_ZERO = {
     "lidar.min_range",
     "lidar.angle_sigma",
     "registration.reassociation_distance",
+    "knn.distance_weight",
+    "knn.min_score",
+    "point_map.cube_margin",
+    "point_map.nearer_by",
     "motion.initial_error",
     "registration.degeneracy_ratio",
     "motion.error_decay",
 }
-_AT_MOST_ONE = {"motion.error_decay", "registration.degeneracy_ratio", "registration.information_scale"}
+_AT_MOST_ONE = {
+    "knn.min_score",
+    "motion.error_decay",
+    "registration.degeneracy_ratio",
+    "registration.information_scale",
+}
 
 
 def invalid_value(path: str, value: Any) -> str:

@@ -22,6 +22,7 @@ import yaml
 from lio_jax.core.config import Config, invalid_config
 from lio_jax.core.errors import UsageError
 from lio_jax.core.params import DEFAULTS, Params, invalid_value, params_from_values
+from lio_jax.core.recipe_values import RECIPE_VALUES
 
 
 @dataclass(frozen=True)
@@ -86,8 +87,16 @@ class Settings:
         return yaml.safe_dump(self.as_dict(), sort_keys=False, default_flow_style=None, width=100)
 
 
+def recipe_settings(recipe: str) -> Settings:
+    """Return a recipe's own settings: the defaults with the values in which it differs."""
+    settings = Settings(recipe=recipe)
+    for path, value in RECIPE_VALUES.get(recipe, {}).items():
+        settings = settings.with_value(path, value, recipe)
+    return dataclasses.replace(settings, given=frozenset())
+
+
 def settings_from_yaml(text: str, source: str, base: Settings | None = None) -> Settings:
-    """Read settings on top of ``base`` (default: the defaults).
+    """Read settings on top of ``base``; where it is not given, of the text's recipe's own settings.
 
     Args:
         text: YAML.
@@ -102,11 +111,11 @@ def settings_from_yaml(text: str, source: str, base: Settings | None = None) -> 
     except yaml.YAMLError as error:
         reason = " ".join(str(error).split())
         raise UsageError(f"{source}: not valid YAML ({reason}).") from None
-    settings = base or Settings()
     if tree is None:
-        return settings
+        return base or Settings()
     if not isinstance(tree, dict):
         raise UsageError(f"{source}: expected keys 'recipe', 'config' and 'params', found {tree!r}.")
+    settings = base or recipe_settings(str(tree.get("recipe", Settings.recipe)))
     for path, value in _leaves(tree, source):
         settings = settings.with_value(path, value, source)
     return checked_together(settings, source)

@@ -13,6 +13,8 @@ from lio_jax.data.sequence import ImuData
 
 GAP_FACTOR = 5.0
 """An interval longer than this many median ones is a gap."""
+LARGEST = 1e5
+"""A reading beyond this is a fault of the recording in any unit: 10,000 g in m/s^2."""
 _NAMED_AT_MOST = 3
 _LATE_S = 0.1
 
@@ -22,10 +24,10 @@ def cleaned(
 ) -> tuple[ImuData, tuple[str, ...]]:
     """Drop samples that cannot be used, convert units, and say what was done and what looks wrong.
 
-    Dropped are samples that are not finite, repeat a stamp, or step back in time: of the order they were
-    recorded in, the longest part whose time ascends is kept, of several the one recorded first. An
-    accelerometer in g is converted. Gaps, saturation, a gyroscope in deg/s and a specific force that points
-    down at rest are only reported. Times are named in s from the recording's first sample.
+    Dropped are samples that are not finite or impossibly large, repeat a stamp, or step back in time: of the
+    order they were recorded in, the longest part whose time ascends is kept, of several the one recorded
+    first. An accelerometer in g is converted. Gaps, saturation, a gyroscope in deg/s and a specific force
+    that points down at rest are only reported. Times are named in s from the recording's first sample.
 
     Args:
         imu: in recorded order.
@@ -112,14 +114,16 @@ def _only(imu: ImuData, kept: NDArray[np.bool_]) -> ImuData:
 
 
 def _finite(imu: ImuData, said: list[str]) -> NDArray[np.bool_]:
-    finite = np.asarray(np.isfinite(np.hstack([imu.gyro, imu.accel])).all(axis=1))
-    if not finite.all():
-        bad = np.flatnonzero(~finite)
+    values = np.hstack([imu.gyro, imu.accel])
+    possible = np.asarray((np.abs(values) < LARGEST).all(axis=1))
+    if not possible.all():
+        bad = np.flatnonzero(~possible)
         seconds = (imu.stamp_ns[bad[0]] - imu.stamp_ns[0]) * 1e-9
-        said.append(
-            f"{len(bad)} IMU sample(s) held NaN or infinity, the first at {seconds:.3f} s, and were dropped."
+        what = (
+            "NaN or infinity" if not np.isfinite(values[bad]).all() else "a value beyond any sensor's range"
         )
-    return finite
+        said.append(f"{len(bad)} IMU sample(s) held {what}, the first at {seconds:.3f} s, and were dropped.")
+    return possible
 
 
 def _ascending(stamp_ns: NDArray[np.int64], origin_ns: int, said: list[str]) -> NDArray[np.bool_]:

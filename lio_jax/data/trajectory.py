@@ -110,13 +110,18 @@ def read_tum(path: Path) -> Trajectory:
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write ``t x y z qx qy qz qw`` with 9 decimals of time."""
-    lines = [
+    path.write_text(tum_lines(trajectory))
+
+
+def tum_lines(trajectory: Trajectory) -> str:
+    """Return the lines of :func:`write_tum`, each with its line break."""
+    lines = (
         f"{ns_to_seconds(int(stamp))} " + " ".join(f"{value:.9f}" for value in (*position, *quaternion))
         for stamp, position, quaternion in zip(
             trajectory.stamp_ns, trajectory.positions, trajectory.quaternions, strict=True
         )
-    ]
-    path.write_text("\n".join(lines) + "\n")
+    )
+    return "".join(f"{line}\n" for line in lines)
 
 
 def read_kitti_poses(path: Path) -> NDArray[np.float64]:

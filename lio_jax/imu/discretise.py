@@ -11,6 +11,13 @@ UNKNOWN_RATE = 0.3
 UNKNOWN_ACCEL = 3.0
 """Acceleration where no sample tells it, as white noise, m/s^2/sqrt(Hz): 1 m/s after 0.1 s."""
 
+DENSE = 0.03
+"""Samples no farther apart than this, s, leave nothing untold between them."""
+UNTOLD_RATE = 0.3
+"""How far the angular rate strays between sparser samples, rad/s per s between them."""
+UNTOLD_ACCEL = 6.0
+"""How far the acceleration strays between sparser samples, m/s^2 per s between them."""
+
 
 class IntervalNoise(eqx.Module):
     """Variances per axis of what disturbs each interval."""
@@ -25,7 +32,9 @@ class IntervalNoise(eqx.Module):
     """Of the accelerometer's bias at the end against that at the start, (m/s^2)^2."""
 
 
-def discretise(params: ImuParams, duration: Float[Array, " n"], known: Bool[Array, " n"]) -> IntervalNoise:
+def discretise(
+    params: ImuParams, duration: Float[Array, " n"], gap: Float[Array, " n"], known: Bool[Array, " n"]
+) -> IntervalNoise:
     """Return the variances of what is constant in an interval of h seconds.
 
     White noise: density^2 / h; a random walk from start to end: density^2 h. Linear
@@ -34,17 +43,20 @@ def discretise(params: ImuParams, duration: Float[Array, " n"], known: Bool[Arra
     Args:
         params: the sensor's densities.
         duration: h, s.
+        gap: between the samples around the interval, s: far apart, they leave motion untold.
         known: False where no sample tells the motion: it is then white noise of the densities above.
     """
     real = duration > 0
     per_second = jnp.where(real, 1 / jnp.where(real, duration, 1.0), 0.0)
+    # an error of sigma = untold * gap that lasts for a gap, as a density: sigma^2 gap
+    sparse = jnp.where(gap > DENSE, gap**3, 0.0)
 
-    def white(density: Float[Array, ""], unknown: float) -> Float[Array, " n"]:
-        return per_second * (density**2 + jnp.where(known, 0.0, unknown**2))
+    def white(density: Float[Array, ""], untold: float, unknown: float) -> Float[Array, " n"]:
+        return per_second * (density**2 + jnp.where(known, untold**2 * sparse, unknown**2))
 
     return IntervalNoise(
-        gyro=white(params.gyro_noise, UNKNOWN_RATE),
-        accel=white(params.accel_noise, UNKNOWN_ACCEL),
+        gyro=white(params.gyro_noise, UNTOLD_RATE, UNKNOWN_RATE),
+        accel=white(params.accel_noise, UNTOLD_ACCEL, UNKNOWN_ACCEL),
         gyro_bias=params.gyro_bias_walk**2 * duration,
         accel_bias=params.accel_bias_walk**2 * duration,
     )

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from lio_jax.imu.rotation_integrals import rotation_integrals, skew
+from lio_jax.imu.rotation_integrals import integral_derivatives, rotation_integrals, skew
 
 NAV_DOF = 9
 """Rotation, position, velocity, in the frame of the last instant: the order of the error state."""
@@ -89,20 +89,16 @@ def sensitivity(
     start, back = matrix[:-1], matrix[-1].T
     first, second = _integrals(rate * duration[:, None], turning)
 
-    def gain(rate: Array) -> Array:
-        return jnp.stack(_gain(rate, accel, duration, turning), -2)
-
-    axes = jnp.broadcast_to(jnp.eye(3, dtype=rate.dtype)[:, None], (3, *rate.shape))
-    per_rate = jax.vmap(lambda axis: jax.jvp(gain, (rate,), (axis,))[1], out_axes=-1)(axes)
     by_duration = _force_at_end(rate * duration[:, None], accel, turning)
     way_by_duration = duration[:, None, None] * (first @ accel[..., None])
     turned = start @ (first if turning else rotation_integrals(rate * duration[:, None])[0])
     h = duration[:, None, None]
+    first_by, second_by = _by_rotvec(rate * duration[:, None], accel, turning)
     zero = jnp.zeros_like(turned)
     # impulses at the end of each interval, in the first frame: columns rate, specific force, duration
     rotation = jnp.concatenate([h * turned, zero, (start @ rate[..., None])], -1)
-    velocity = start @ jnp.concatenate([per_rate[:, 0], h * first, by_duration], -1)
-    position = start @ jnp.concatenate([per_rate[:, 1], h**2 * second, way_by_duration], -1)
+    velocity = start @ jnp.concatenate([h**2 * first_by, h * first, by_duration], -1)
+    position = start @ jnp.concatenate([h**3 * second_by, h**2 * second, way_by_duration], -1)
     position = position.at[..., 6].add(increments.velocity[:-1])
     # what the impulses have become at the end
     left = (increments.time[-1] - increments.time[1:])[:, None, None]
@@ -156,6 +152,12 @@ def _multiply(p: Float[Array, "*b 4"], q: Float[Array, "*b 4"]) -> Float[Array, 
 
 def _knots(steps: Float[Array, "n *s"]) -> Float[Array, "k *s"]:
     return jnp.concatenate([jnp.zeros_like(steps[:1]), jnp.cumsum(steps, axis=0)])
+
+
+def _by_rotvec(rotvec: Float[Array, "n 3"], accel: Float[Array, "n 3"], turning: bool) -> tuple[Array, Array]:
+    if turning:
+        return integral_derivatives(rotvec, accel)
+    return (jnp.zeros((*rotvec.shape, 3), rotvec.dtype),) * 2
 
 
 def _force_at_end(rotvec: Float[Array, "n 3"], accel: Float[Array, "n 3"], turning: bool) -> Array:

@@ -12,11 +12,14 @@ _SERIES_BELOW = 4.0
 _TERMS = 12
 
 
-def rotation_coefficients(angle_squared: Float[Array, "*b"]) -> tuple[Array, Array, Array, Array]:
-    """Return a = sin(t)/t, b = (1-cos(t))/t^2, c = (t-sin(t))/t^3 and d = (t^2/2-1+cos(t))/t^4.
+def rotation_coefficients(angle_squared: Float[Array, "*b"]) -> tuple[Array, ...]:
+    """Return s_n, the sum over k of (-t^2)^k / (2k+n)!, for n from 1 to 6.
+
+    The first are a = sin(t)/t, b = (1-cos(t))/t^2, c = (t-sin(t))/t^3 and d = (t^2/2-1+cos(t))/t^4.
 
     With them, for phi = t * axis and X the cross product with phi: Exp(phi) = I + a X + b X^2, its integral
-    over the unit interval I + b X + c X^2, and the integral of that I/2 + c X + d X^2.
+    over the unit interval I + b X + c X^2, and the integral of that I/2 + c X + d X^2. The derivative of
+    s_n by t^2 is (n s_(n+2) - s_(n+1)) / 2.
 
     Args:
         angle_squared: t^2, rad^2.
@@ -25,19 +28,19 @@ def rotation_coefficients(angle_squared: Float[Array, "*b"]) -> tuple[Array, Arr
     safe = jnp.where(small, 1.0, angle_squared)
     angle = jnp.sqrt(safe)
     sine, versine = jnp.sin(angle), 1 - jnp.cos(angle)
-    exact = (
+    a, b, c, d = (
         sine / angle,
         versine / safe,
         (angle - sine) / (safe * angle),
         (safe / 2 - versine) / safe**2,
     )
-    series = rotation_series(jnp.where(small, angle_squared, 0.0))
-    a, b, c, d = (jnp.where(small, near, far) for near, far in zip(series, exact, strict=True))
-    return a, b, c, d
+    exact = (a, b, c, d, (1 / 6 - c) / safe, (1 / 24 - d) / safe)
+    x = jnp.where(small, angle_squared, 0.0)
+    return tuple(jnp.where(small, _series(x, order), exact[order - 1]) for order in range(1, 7))
 
 
 def rotation_series(angle_squared: Float[Array, "*b"]) -> tuple[Array, Array, Array, Array]:
-    """Return :func:`rotation_coefficients` up to ``SERIES_LIMIT``, cheaper in large batches.
+    """Return the first four of :func:`rotation_coefficients` up to ``SERIES_LIMIT``, cheap in batches.
 
     Args:
         angle_squared: rad^2.
@@ -64,12 +67,29 @@ def rotation_integrals(rotvec: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3
     Args:
         rotvec: rad.
     """
-    _, b, c, d = rotation_coefficients(jnp.sum(rotvec**2, -1))
+    _, b, c, d, _, _ = rotation_coefficients(jnp.sum(rotvec**2, -1))
     cross = skew(rotvec)
     square = cross @ cross
     identity = jnp.eye(3, dtype=rotvec.dtype)
     b, c, d = b[..., None, None], c[..., None, None], d[..., None, None]
     return identity + b * cross + c * square, identity / 2 + c * cross + d * square
+
+
+def integral_derivatives(
+    rotvec: Float[Array, "*b 3"], vector: Float[Array, "*b 3"]
+) -> tuple[Float[Array, "*b 3 3"], Float[Array, "*b 3 3"]]:
+    """Return the derivatives by ``rotvec`` of ``vector`` under both :func:`rotation_integrals`."""
+    _, b, c, d, e, f = (x[..., None, None] for x in rotation_coefficients(jnp.sum(rotvec**2, -1)))
+    once = jnp.cross(rotvec, vector)
+    twice = jnp.cross(rotvec, once)
+    row, column = rotvec[..., None, :], vector[..., None]
+    of_once = -skew(vector)
+    inner = jnp.sum(rotvec * vector, -1)[..., None, None] * jnp.eye(3, dtype=rotvec.dtype)
+    of_twice = inner + rotvec[..., None] * vector[..., None, :] - 2 * column * row
+    once, twice = once[..., None] * row, twice[..., None] * row
+    first = b * of_once + (2 * d - c) * once + c * of_twice + (3 * e - d) * twice
+    second = c * of_once + (3 * e - d) * once + d * of_twice + (4 * f - e) * twice
+    return first, second
 
 
 def skew(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:

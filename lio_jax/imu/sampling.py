@@ -19,6 +19,8 @@ class Intervals(eqx.Module):
     """Mean measured angular rate, rad/s, IMU frame."""
     accel: Float[Array, "n 3"]
     """Mean measured specific force, m/s^2, IMU frame."""
+    gap: Float[Array, " n"]
+    """Time between the two samples around each interval, s."""
     known: Bool[Array, " n"]
     """False where the samples are too far away to tell the motion."""
     measured: Bool[Array, ""]
@@ -76,4 +78,4 @@ def sample_intervals(
     near &= (time < end + LONGEST_GAP) | (jnp.min(jnp.where(valid, time, jnp.inf)) <= start)
     any_near = jnp.any(valid & near)
     mean = jnp.where(any_near, (values[1:] + values[:-1]) / 2, 0.0)
-    return Intervals(duration, mean[:, :3], mean[:, 3:], (gap <= LONGEST_GAP) & any_near, any_near)
+    return Intervals(duration, mean[:, :3], mean[:, 3:], gap, (gap <= LONGEST_GAP) & any_near, any_near)

@@ -60,7 +60,7 @@ def propagate(
     effect = sensitivity(increments, intervals.duration, path.rate, path.accel)
     by_offset = _effect_of_time_offset(nav, imu, start, end, effect)
     transition = _transition(nav, increments, effect, by_offset, path.gravity, intervals.measured)
-    noise = discretise(params, intervals.duration, intervals.known)
+    noise = discretise(params, intervals.duration, intervals.gap, intervals.known)
     added = process_noise(effect, noise, intervals.measured)
     covariance = _carry_covariance(state.covariance, transition).at[:15, :15].add(added)
     return Uncertain(moved, (covariance + covariance.T) / 2), path

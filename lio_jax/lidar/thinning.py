@@ -4,7 +4,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float32, Int32
 
-from lio_jax.core.config import Config
 from lio_jax.core.params import Params
 from lio_jax.core.types import Scan
 from lio_jax.lidar.downsample import Selection, select_per_voxel
@@ -24,16 +23,21 @@ class ThinnedScan(eqx.Module):
     """Occupied cells beyond the capacities."""
 
 
-def thinned(config: Config, params: Params, scan: Scan) -> ThinnedScan:
-    """Return the scan within its range limits, thinned to the spacings of map and registration."""
+def thinned(params: Params, scan: Scan, insertion_points: int, registration_points: int) -> ThinnedScan:
+    """Return the scan within its range limits, thinned to the spacings of map and registration.
+
+    Args:
+        params: range limits and spacings.
+        scan: padded sweep.
+        insertion_points: capacity for the map.
+        registration_points: capacity of those to match.
+    """
     squared_range = jnp.sum(scan.points**2, -1)
     near, far = params.lidar.min_range.astype(jnp.float32), params.lidar.max_range.astype(jnp.float32)
     mask = scan.mask & (squared_range > near**2) & (squared_range < far**2)
-    chosen = select_per_voxel(scan.points, mask, params.map.point_spacing, config.lidar.insertion_points)
+    chosen = select_per_voxel(scan.points, mask, params.map.point_spacing, insertion_points)
     points = scan.points[chosen.index]
-    matched = select_per_voxel(
-        points, chosen.mask, params.registration.point_spacing, config.lidar.registration_points
-    )
+    matched = select_per_voxel(points, chosen.mask, params.registration.point_spacing, registration_points)
     return ThinnedScan(
         points, scan.time[chosen.index], chosen.mask, matched, chosen.dropped + matched.dropped
     )

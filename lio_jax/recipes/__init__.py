@@ -3,9 +3,9 @@
 from types import ModuleType
 
 from lio_jax.core.errors import UsageError
-from lio_jax.recipes import default
+from lio_jax.recipes import default, fast_lio2
 
-RECIPES: dict[str, ModuleType] = {"default": default}
+RECIPES: dict[str, ModuleType] = {"default": default, "fast_lio2": fast_lio2}
 """By name; each module has State, Output, init(config, params), step(config, params, state, scan, imu) and
 restart(config, params, state)."""
 

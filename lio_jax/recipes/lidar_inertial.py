@@ -4,8 +4,6 @@ scan -> thin --------> deskew -> iterated update (match, linearise) -> insert ->
 imu  -> propagate --/------------/
 """
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,24 +14,21 @@ from lio_jax.core.config import Config
 from lio_jax.core.error_state import Uncertain
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan
-from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement, Update
+from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
 from lio_jax.estimation.nav_update import update_nav
 from lio_jax.estimation.pose_measurement import keep_observed, lidar_pose_jacobian
-from lio_jax.imu.initialise import initialise_at_rest
-from lio_jax.imu.path import Path, deskew_along
-from lio_jax.imu.strapdown import propagate
+from lio_jax.imu.path import deskew_along
 from lio_jax.lidar.thinning import thinned
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
-from lio_jax.recipes.output import Output
-from lio_jax.registration.scan_to_map import (
-    Association,
-    Frame,
-    NormalEquations,
-    Registration,
-    associated,
-    linearise,
-    no_association,
+from lio_jax.recipes.inertial_filter import (
+    Linearised,
+    levelled_start,
+    lidar_pose,
+    predicted,
+    registration_of,
 )
+from lio_jax.recipes.output import Output
+from lio_jax.registration.scan_to_map import Association, Frame, associated, linearise, no_association
 
 
 class State(eqx.Module):
@@ -62,17 +57,7 @@ def init(config: Config, params: Params, imu: ImuBatch, velocity: Float[Array, "
         imu: samples of about a second up to the first scan's end.
         velocity: in world, m/s, where it is known; None: that of a vehicle at rest.
     """
-    start = initialise_at_rest(
-        imu,
-        params.imu,
-        params.initial,
-        params.extrinsics.T_imu_lidar(),
-        params.extrinsics.time_offset,
-    )
-    uncertain = start.start
-    if velocity is not None:
-        moving = jnp.where(start.is_still, uncertain.nav.velocity, velocity)
-        uncertain = Uncertain(dataclasses.replace(uncertain.nav, velocity=moving), uncertain.covariance)
+    uncertain = levelled_start(params, imu, velocity)
     return State(
         uncertain=uncertain,
         prediction_error=jnp.asarray(params.motion.initial_error, uncertain.covariance.dtype),
@@ -92,10 +77,10 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
         imu: samples around that time.
     """
     first = state.scans == 0
-    thin = thinned(config, params, scan)
+    thin = thinned(params, scan, config.imu.insertion_points, config.imu.registration_points)
     with jax.named_scope("predict"):
-        prior, path = _predicted(params, state.uncertain, scan, imu, first)
-        T_predicted = _lidar_pose(prior.nav)
+        prior, path = predicted(params, state.uncertain, scan, imu, first)
+        T_predicted = lidar_pose(prior.nav)
         points = deskew_along(path, prior.nav.T_imu_lidar, thin.points, thin.time)
     with jax.named_scope("update"):
         frame = Frame(*anchor_of(T_predicted.translation(), params.map.voxel_size))
@@ -112,7 +97,7 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
         )
         posterior: Uncertain = update.state
         lost = (update.status > ITERATION_LIMIT) & ~first
-        T_world_lidar = _lidar_pose(posterior.nav)
+        T_world_lidar = lidar_pose(posterior.nav)
         missed = jnp.linalg.norm((T_predicted.inverse() @ T_world_lidar).translation())
         error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
     with jax.named_scope("insert"):
@@ -133,7 +118,7 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
         map=vmap,
     )
     return new_state, Output(
-        registration=_registration(update, T_world_lidar),
+        registration=registration_of(update, update.measurement.aux.linearised, T_world_lidar),
         lost=lost,
         nis=update.innovation.nis,
         nis_dof=update.innovation.dof,
@@ -147,29 +132,12 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
     )
 
 
-def _predicted(
-    params: Params, last: Uncertain, scan: Scan, imu: ImuBatch, first: Bool[Array, ""]
-) -> tuple[Uncertain, Path]:
-    """Return the state at the scan's end and the motion since the last scan's end."""
-    dtype = last.covariance.dtype
-    end = scan.duration.astype(dtype)
-    start = jnp.where(first, 0.0, end - scan.interval.astype(dtype))
-    moved, path = propagate(last, imu, params.imu, start, end)
-    # the first scan's end is the world's origin: its samples only deskew it
-    return jax.tree.map(lambda new, old: jnp.where(first, old, new), moved, last), path
-
-
-def _lidar_pose(nav: NavState) -> jaxlie.SE3:
-    return jaxlie.SE3((nav.T_world_imu @ nav.T_imu_lidar).wxyz_xyz)
-
-
 class _Trial(eqx.Module):
     """What one linearisation leaves to the next."""
 
     association: Association
     iteration: Int32[Array, ""]
-    equations: NormalEquations
-    degenerate: Bool[Array, " 6"]
+    linearised: Linearised
 
 
 class _ScanMatch(eqx.Module):
@@ -184,16 +152,13 @@ class _ScanMatch(eqx.Module):
 
     def before(self, T_world_lidar: jaxlie.SE3) -> _Trial:
         """Return what the first linearisation starts from."""
-        zero = jnp.zeros((), T_world_lidar.wxyz_xyz.dtype)
-        nothing = NormalEquations(jnp.zeros((6, 6)), jnp.zeros(6), jnp.int32(0), zero, zero, zero)
-        return _Trial(
-            no_association(self.mask, T_world_lidar), jnp.int32(0), nothing, jnp.zeros(6, jnp.bool_)
-        )
+        nothing = Linearised.nothing(T_world_lidar.wxyz_xyz.dtype)
+        return _Trial(no_association(self.mask, T_world_lidar), jnp.int32(0), nothing)
 
     def measure(self, nav: NavState, last: _Trial) -> Measurement:
         """Match and linearise at ``nav``; the kernel opens and narrows as in :func:`register`."""
         settings = self.params.registration
-        T = _lidar_pose(nav)
+        T = lidar_pose(nav)
         opening = self.prediction_error * 0.5 ** last.iteration.astype(self.prediction_error.dtype)
         association = associated(
             last.association, self.map, self.points, self.mask, T, self.frame, self.params
@@ -209,24 +174,6 @@ class _ScanMatch(eqx.Module):
             gradient=settings.information_scale * gradient,
             jacobian=lidar_pose_jacobian(nav),
             lost=equations.matches < settings.min_matches,
-            aux=_Trial(association, last.iteration + 1, equations, degenerate),
+            aux=_Trial(association, last.iteration + 1, Linearised(equations, degenerate)),
             settled=opening < settings.kernel,
         )
-
-
-def _registration(update: Update, T_world_lidar: jaxlie.SE3) -> Registration:
-    """Return the update in the terms of a scan-to-map solve."""
-    trial: _Trial = update.measurement.aux
-    equations = trial.equations
-    to_body = jax.scipy.linalg.block_diag(*[T_world_lidar.rotation().as_matrix()] * 2)
-    return Registration(
-        T_world_lidar=T_world_lidar,
-        information=to_body.T @ update.measurement.information @ to_body,
-        degenerate=trial.degenerate,
-        matches=equations.matches,
-        rmse=jnp.sqrt(
-            equations.squared_error / jnp.maximum(equations.weight, jnp.finfo(equations.weight.dtype).tiny)
-        ),
-        iterations=update.iterations,
-        status=update.status,
-    )

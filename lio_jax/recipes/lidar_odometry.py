@@ -79,7 +79,7 @@ def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[Stat
         scan: padded sweep; ``scan.interval`` is the time since the last scan's end.
     """
     with jax.named_scope("thin"):
-        thin = thinned(config, params, scan)
+        thin = thinned(params, scan, config.lidar.insertion_points, config.lidar.registration_points)
         delay = thin.time - 0.5 * scan.duration
         matched = thin.matched
     with jax.named_scope("predict"):

@@ -13,6 +13,7 @@ from lio_jax.run.map_file import SPOOL_SUFFIX
 RUN_FILES = (
     "trajectory.tum",
     "trajectory_kitti.txt",
+    "imu_rate.tum",
     "states.npz",
     "map.pcd",
     "keyframes.g2o",

@@ -44,6 +44,11 @@ class ImuFeed:
         self._span: tuple[int, int] | None = None
         self._scans = self._without = self._thinned = 0
 
+    @property
+    def samples(self) -> ImuData | None:
+        """Return the recording's samples, None where it has none."""
+        return self._imu
+
     def batch(self, scan: LidarScan, last_end_ns: int | None) -> ImuBatch:
         """Return the samples from the last scan's end to this scan's, and the neighbours on both sides.
 

@@ -23,6 +23,7 @@ from lio_jax.data.trajectory import Trajectory, write_kitti_poses, write_tum
 from lio_jax.loops.g2o import write_g2o
 from lio_jax.run.folder import write_json, write_text
 from lio_jax.run.imu_feed import OFFSET_MARGIN_S, ImuFeed
+from lio_jax.run.imu_rate import write_imu_rate
 from lio_jax.run.keyframes import keyframe_indices, odometry_edges
 from lio_jax.run.map_file import MapFile
 from lio_jax.run.overflow import Overflow
@@ -131,6 +132,8 @@ def run_sequence(
             raise LioJaxError(f"{sequence.info.path}: no scan could be read. {reasons}".strip())
         map_points = map_file.finish() if map_file else None
         _write_trajectory(out, log, settings)
+        if imu and imu.samples:
+            write_imu_rate(out / "imu_rate.tum", log, imu.samples)
     finally:
         if map_file:
             map_file.close()

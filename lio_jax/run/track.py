@@ -16,7 +16,7 @@ from lio_jax.core.params import Params
 from lio_jax.core.settings import Settings
 from lio_jax.data.sequence import LidarScan
 from lio_jax.recipes import recipe_named
-from lio_jax.registration.scan_to_map import CONVERGED, ITERATION_LIMIT
+from lio_jax.run.failures import Evidence, failure_of, longest_gap
 from lio_jax.run.feed import bucket_for, padded
 from lio_jax.run.imu_feed import ImuFeed
 
@@ -96,6 +96,7 @@ def track(
     before: Any = None
     last_end_ns, last_count, size = None, 0, 0
     opening: list[Any] = []
+    last_evidence: Evidence | None = None
     for index, scan in enumerate(scans):
         start = time.perf_counter()
         count = len(scan.points)
@@ -115,9 +116,19 @@ def track(
             opening.append((arrays, samples))
         state, output = step(state, arrays, samples)
         nav, result = jax.tree.map(np.array, (state.nav, output.registration))
-        lost = bool(output.lost)
+        lost, nis = bool(output.lost), float(output.nis)
         done = time.perf_counter()
-        last_end_ns, last_count = scan.end_ns, count
+        evidence = Evidence(
+            points=count,
+            nav=nav,
+            registration=result,
+            lost=lost,
+            nis=nis,
+            since_last_s=float(arrays.interval),
+            imu_gap_s=_imu_gap(samples, arrays, nav) if samples else None,
+        )
+        failure = failure_of(evidence, last_evidence, settings)
+        last_end_ns, last_count, last_evidence = scan.end_ns, count, evidence
         pad_ms = (padded_at - start) * 1e3
         step_ms = (done - padded_at - (step.compile_s - compiled_s)) * 1e3
         yield Tracked(
@@ -128,7 +139,7 @@ def track(
             output=output,
             scan_points=count,
             stage_ms={"pad": pad_ms, "step": step_ms, "total": pad_ms + step_ms},
-            failure=_failure(count, result, lost, settings),
+            failure=failure,
         )
 
 
@@ -156,19 +167,7 @@ def pose_matrix(wxyz_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     return pose
 
 
-def _failure(points: int, result: Any, lost: bool, settings: Settings) -> str:
-    if points == 0:
-        return "it holds no points; the pose is the prediction."
-    if lost:
-        needed = settings.values["registration"]["min_matches"]
-        return (
-            f"{int(result.matches)} points matched the map, {needed:g} are needed; "
-            "the pose is the prediction."
-        )
-    if result.status == ITERATION_LIMIT:
-        limit = settings.config.registration.max_iterations
-        return f"registration did not converge in {limit} iterations; its last pose was kept."
-    # too few matches without being lost: the scan that starts the map
-    if result.status == CONVERGED and (weak := int(result.degenerate.sum())):
-        return f"the scene leaves {weak} of 6 directions unobserved; there the prediction was kept."
-    return ""
+def _imu_gap(samples: Any, scan: Any, nav: Any) -> float:
+    """Return the longest time without an inertial sample since the last scan's end, s."""
+    end = float(scan.duration) + float(nav.time_offset)
+    return longest_gap(samples, end - float(scan.interval or scan.duration), end)

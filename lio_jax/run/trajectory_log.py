@@ -3,10 +3,13 @@
 from pathlib import Path
 from typing import Any
 
+import jaxlie
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from lio_jax.core.files import atomic_path
+from lio_jax.core.types import NavState
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.run.covariance import carried, covariance_of
 from lio_jax.run.track import Tracked, pose_matrix
@@ -44,6 +47,20 @@ class TrajectoryLog:
             }
         )
 
+    def nav(self, index: int) -> NavState:
+        """Return one scan's navigation state, numpy leaves."""
+        row = self._rows[index]
+        biases: Any = row["biases"]
+        return NavState(
+            T_world_imu=_se3(row["poses"], row["velocity"].dtype),
+            velocity=row["velocity"],
+            gyro_bias=biases[:3],
+            accel_bias=biases[3:],
+            gravity=row["gravity"],
+            T_imu_lidar=_se3(row["extrinsic"], row["velocity"].dtype),
+            time_offset=row["time_offset"],
+        )
+
     def column(self, name: str) -> NDArray:
         """Return one quantity of all scans, stacked."""
         return np.stack([row[name] for row in self._rows])
@@ -78,6 +95,12 @@ class TrajectoryLog:
         with atomic_path(path) as aside:
             columns: dict[str, Any] = {name: self.column(name) for name in self._rows[0]}
             np.savez_compressed(aside, **columns)
+
+
+def _se3(pose: NDArray[np.float64], dtype: np.dtype) -> jaxlie.SE3:
+    wxyz = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
+    leaf: Any = np.concatenate([wxyz, pose[:3, 3]]).astype(dtype)
+    return jaxlie.SE3(leaf)
 
 
 def _covariance(tracked: Tracked) -> NDArray[np.float64]:

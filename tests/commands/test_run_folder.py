@@ -90,6 +90,8 @@ def test_states_have_their_shapes(run):
         "gravity": (COUNT, 3),
         "extrinsic": (COUNT, 4, 4),
         "time_offset": (COUNT,),
+        "nis": (COUNT,),
+        "nis_dof": (COUNT,),
         "covariance": (COUNT, 6, 6),
     }
     assert states["stamps_ns"].dtype == np.int64

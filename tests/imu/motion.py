@@ -1,11 +1,16 @@
 """A smooth handheld motion in closed form and what an ideal inertial sensor on it measures."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
 from lio_jax.core.types import ImuBatch, NavState
+
+quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+"""Compiles in half the time; these tests run their programs only a few times."""
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 GYRO_BIAS = np.array([0.02, -0.01, 0.03])
@@ -51,13 +56,20 @@ def pose_matrix(t: float) -> np.ndarray:
     return np.asarray(nav_at(t).T_world_imu.as_matrix())
 
 
-def ideal_imu(times: np.ndarray, origin: float = 0.0, time_offset: float = 0.0, pad: int = 0) -> ImuBatch:
-    """Return the samples taken at ``times`` on the lidar's clock, stamped by the IMU from ``origin`` on."""
-    rate, force = jax.vmap(measured)(jnp.asarray(times))
-    grown = ((0, pad), (0, 0))
+_measured = jax.jit(jax.vmap(measured))
+
+
+def ideal_imu(times: np.ndarray, origin: float = 0.0, time_offset: float = 0.0, size: int = 48) -> ImuBatch:
+    """Return the samples taken at ``times`` on the lidar's clock, stamped by the IMU from ``origin`` on.
+
+    They are padded to ``size`` with rows that are not a number.
+    """
+    mask = np.arange(size) < len(times)
+    padded = np.pad(times, (0, size - len(times)))
+    rate, force = _measured(jnp.asarray(padded))
     return ImuBatch(
-        time=jnp.pad(jnp.asarray(times) - origin + time_offset, (0, pad), constant_values=jnp.nan),
-        gyro=jnp.pad(rate + GYRO_BIAS, grown, constant_values=jnp.nan),
-        accel=jnp.pad(force + ACCEL_BIAS, grown, constant_values=jnp.nan),
-        mask=jnp.arange(len(times) + pad) < len(times),
+        time=jnp.asarray(np.where(mask, padded - origin + time_offset, np.nan)),
+        gyro=jnp.where(mask[:, None], rate + GYRO_BIAS, jnp.nan),
+        accel=jnp.where(mask[:, None], force + ACCEL_BIAS, jnp.nan),
+        mask=jnp.asarray(mask),
     )

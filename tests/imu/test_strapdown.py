@@ -11,7 +11,7 @@ from lio_jax.core.error_state import ACCEL_BIAS, DOF, GYRO_BIAS, Uncertain, loca
 from lio_jax.core.params import default_params
 from lio_jax.core.types import ImuBatch
 from lio_jax.imu.strapdown import path_along, propagate
-from tests.imu.motion import ideal_imu, nav_at, pose_matrix, velocity
+from tests.imu.motion import ideal_imu, nav_at, pose_matrix, quick_jit, velocity
 
 PARAMS = default_params().imu
 NOISELESS = jax.tree.map(jnp.zeros_like, PARAMS)
@@ -24,11 +24,11 @@ ORIGIN = 1.0
 @pytest.fixture(scope="module")
 def imu() -> ImuBatch:
     """Return samples around [START, END] on the lidar's clock, whose zero is at ORIGIN, with padding."""
-    return ideal_imu(ORIGIN + TIMES, ORIGIN, OFFSET, pad=4)
+    return ideal_imu(ORIGIN + TIMES, ORIGIN, OFFSET)
 
 
-step = jax.jit(propagate)
-follow = jax.jit(path_along)
+step = quick_jit(propagate)
+follow = quick_jit(path_along)
 
 
 def state(time: float, covariance: np.ndarray | None = None) -> Uncertain:
@@ -36,7 +36,7 @@ def state(time: float, covariance: np.ndarray | None = None) -> Uncertain:
     return Uncertain(nav_at(time, OFFSET), jnp.asarray(matrix))
 
 
-@jax.jit
+@quick_jit
 def transition(nav, imu):
     """Return the derivative of the propagated mean by forward differentiation through the retraction."""
 
@@ -94,7 +94,7 @@ def test_the_transition_at_rest_is_finite_and_right(imu: ImuBatch) -> None:
 def test_the_transition_of_the_time_offset_is_a_finite_difference(imu: ImuBatch, row: int) -> None:
     """By differences of whole propagations, with noise on the samples so that the shift matters."""
     nav = state(ORIGIN).nav
-    noisy = dataclasses.replace(imu, gyro=imu.gyro + jnp.sin(100.0 * jnp.arange(16))[:, None])
+    noisy = dataclasses.replace(imu, gyro=imu.gyro + jnp.sin(100.0 * jnp.arange(48))[:, None])
     h = 1e-6
 
     def end(offset: float):
@@ -122,11 +122,11 @@ def test_frozen_parts_stay_frozen(imu: ImuBatch) -> None:
 
 def test_covariance_is_that_of_noisy_runs() -> None:
     """3000 runs on samples with white noise and walking biases."""
-    runs, count, interval = 3000, 40, 0.005
+    runs, count, interval = 3000, 48, 0.005
     keys = jax.random.split(jax.random.key(0), 4)
     params = dataclasses.replace(PARAMS, gyro_bias_walk=jnp.asarray(0.02), accel_bias_walk=jnp.asarray(0.2))
     span = (jnp.asarray(0.0), jnp.asarray((count - 1) * interval))
-    clean = ideal_imu(ORIGIN + np.arange(count) * interval, ORIGIN, OFFSET)
+    clean = ideal_imu(ORIGIN + np.arange(count) * interval, ORIGIN, OFFSET, size=count)
     begun = state(ORIGIN)
     moved, _ = step(begun, clean, params, *span)
 
@@ -141,7 +141,7 @@ def test_covariance_is_that_of_noisy_runs() -> None:
     gyro = clean.gyro + gyro_walk + white(keys[2], params.gyro_noise)
     accel = clean.accel + accel_walk + white(keys[3], params.accel_noise)
 
-    @jax.jit
+    @quick_jit
     @jax.vmap
     def error(gyro, accel, gyro_drift, accel_drift):
         path = path_along(begun.nav, ImuBatch(clean.time, gyro, accel, clean.mask), *span)
@@ -164,7 +164,7 @@ def test_covariance_is_that_of_noisy_runs() -> None:
 
 
 def test_without_samples_the_velocity_stays_and_the_covariance_grows() -> None:
-    nothing = ideal_imu(np.zeros(0), pad=16)
+    nothing = ideal_imu(np.zeros(0))
     begun = state(ORIGIN, 1e-4 * np.eye(DOF))
     moved, path = step(begun, nothing, PARAMS, jnp.asarray(0.0), jnp.asarray(0.1))
     np.testing.assert_allclose(moved.nav.velocity, begun.nav.velocity, atol=1e-14)
@@ -185,7 +185,7 @@ def test_without_samples_the_velocity_stays_and_the_covariance_grows() -> None:
 def test_a_gap_costs_certainty(imu: ImuBatch) -> None:
     times = np.arange(-2, 16) * 0.05
     full = ideal_imu(ORIGIN + times, ORIGIN, OFFSET)
-    gap = dataclasses.replace(full, mask=full.mask & ((times < 0.1) | (times > 0.55)))
+    gap = dataclasses.replace(full, mask=full.mask & ((full.time < 0.1) | (full.time > 0.55)))
     span = (jnp.asarray(0.0), jnp.asarray(0.7))
     (whole, _), (holed, _) = (step(state(ORIGIN), batch, PARAMS, *span) for batch in (full, gap))
     assert bool(jnp.all(jnp.isfinite(holed.nav.velocity)))
@@ -208,7 +208,7 @@ def reverse():
         )
         return 1e3 * jnp.sum(moved.covariance) + jnp.sum(moved.nav.velocity) + jnp.sum(path.T_world_imu.log())
 
-    return jax.jit(jax.value_and_grad(value, argnums=(0, 1)))
+    return quick_jit(jax.value_and_grad(value, argnums=(0, 1)))
 
 
 @pytest.mark.parametrize("still", [False, True])

@@ -8,7 +8,7 @@ import pytest
 from lio_jax.commands.runtime import prepare_jax
 from lio_jax.core.settings import Settings, with_extrinsics, with_overrides
 from lio_jax.run.track import CompiledStep, Tracked, track
-from tests.run import small_drive
+from tests.run import inertial_drive, small_drive
 from tests.run.program_cache import kept_programs
 
 
@@ -24,6 +24,15 @@ def settings() -> Settings:
     T_imu_lidar = small_drive.drive().info.T_imu_lidar
     assert T_imu_lidar is not None
     one_size = with_overrides(Settings(), ["config.lidar.buckets=[8192]"])
+    return with_extrinsics(one_size, T_imu_lidar, "the drive")
+
+
+@pytest.fixture(scope="session")
+def inertial_settings() -> Settings:
+    """Samples of a 5 s outage fit into the one padded size."""
+    T_imu_lidar = inertial_drive.drive().info.T_imu_lidar
+    assert T_imu_lidar is not None
+    one_size = with_overrides(Settings(), ["config.lidar.buckets=[4096]", "config.imu.buckets=[512]"])
     return with_extrinsics(one_size, T_imu_lidar, "the drive")
 
 

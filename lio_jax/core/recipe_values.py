@@ -1,0 +1,41 @@
+"""The values in which each recipe differs from the defaults of :mod:`lio_jax.core.config` and ``params``."""
+
+from typing import Any
+
+_GYR_COV, _ACC_COV, _B_GYR_COV, _B_ACC_COV = 0.1, 0.1, 1e-4, 1e-4
+_IMU_RATE = 200.0
+"""FAST-LIO2 adds cov dt^2 to its covariance in each step of dt = 1 / rate; a density s adds s^2 dt. So
+s = sqrt(cov / rate), here at the rate of its example recordings, Hz. Its bias walks convert alike."""
+
+RECIPE_VALUES: dict[str, dict[str, Any]] = {
+    "default": {},
+    "fast_lio2": {
+        "config.lidar.registration_points": 4096,
+        "config.map.capacity": 65536,
+        "config.registration.max_iterations": 4,
+        "params.imu.gyro_noise": (_GYR_COV / _IMU_RATE) ** 0.5,
+        "params.imu.accel_noise": (_ACC_COV / _IMU_RATE) ** 0.5,
+        "params.imu.gyro_bias_walk": (_B_GYR_COV / _IMU_RATE) ** 0.5,
+        "params.imu.accel_bias_walk": (_B_ACC_COV / _IMU_RATE) ** 0.5,
+        # square roots of its first variances: 1, 1, 1e-4, 1e-3, 1e-5, 1e-5 and 1e-5
+        "params.initial.rotation_sigma": 1.0,
+        "params.initial.velocity_sigma": 1.0,
+        "params.initial.gyro_bias_sigma": 1e-2,
+        "params.initial.accel_bias_sigma": 1e-3**0.5,
+        "params.initial.gravity_sigma": 1e-5**0.5,
+        "params.initial.extrinsic_rotation_sigma": 1e-5**0.5,
+        "params.initial.extrinsic_translation_sigma": 1e-5**0.5,
+        # its variance of a point's distance from its plane is 1e-3 m^2
+        "params.lidar.range_sigma": 1e-3**0.5,
+        "params.lidar.min_range": 2.0,
+        "params.lidar.max_range": 100.0,
+        "params.map.voxel_size": 0.5,
+        "params.registration.point_spacing": 0.5,
+        "params.registration.information_scale": 1.0,
+        "params.registration.reassociation_distance": 0.01,
+        "params.registration.rotation_tolerance": 1e-3,
+        "params.registration.translation_tolerance": 1e-3,
+        "params.registration.degeneracy_ratio": 0.0,
+    },
+}
+"""By recipe; paths as in a settings file."""

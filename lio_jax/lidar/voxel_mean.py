@@ -1,0 +1,49 @@
+"""Thin a scan to the mean of the points in each voxel, without sorting."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float32, Int32
+
+from lio_jax.core.hashing import voxel_hash
+from lio_jax.core.materialise import materialised
+
+
+class MeanPoints(eqx.Module):
+    """One point per occupied voxel, the real ones first."""
+
+    points: Float32[Array, "k 3"]
+    """m."""
+    mask: Bool[Array, " k"]
+    dropped: Int32[Array, ""]
+    """Occupied voxels that found no room in the capacity."""
+
+
+def mean_per_voxel(
+    points: Float32[Array, "n 3"], mask: Bool[Array, " n"], voxel_size: Float32[Array, ""], capacity: int
+) -> MeanPoints:
+    """Return the mean of each cubic voxel's points, of at most ``capacity`` voxels.
+
+    Voxels are hashed into slots. Of two that share one the second is left out, and slots beyond the capacity
+    are cut off; both thin the scan evenly over space, because slots are hashes.
+
+    Args:
+        points: m, any frame.
+        mask: which rows are real.
+        voxel_size: edge length, m.
+        capacity: number of returned rows.
+    """
+    table_size = 1 << (4 * capacity - 1).bit_length()
+    voxel = jnp.floor(jnp.where(mask[:, None], points, 0.0) / voxel_size).astype(jnp.int32)
+    slot = jnp.where(mask, voxel_hash(voxel) & jnp.uint32(table_size - 1), table_size).astype(jnp.int32)
+    order = jnp.arange(points.shape[0], dtype=jnp.int32)
+    last = jnp.full(table_size, -1, jnp.int32).at[slot].max(order, mode="drop")
+    rank = jnp.cumsum((last >= 0).astype(jnp.int32)) - 1
+    row, winner = (table.at[slot].get(mode="clip") for table in (rank, last))
+    x, y, z = (voxel[:, axis] == voxel[jnp.maximum(winner, 0), axis] for axis in range(3))
+    row = materialised(jnp.where(mask & x & y & z & (row < capacity), row, capacity))
+    count = jnp.zeros(capacity, jnp.float32).at[row].add(1.0, mode="drop")
+    mean = jnp.zeros((capacity, 3), jnp.float32)
+    for axis in range(3):
+        total = jnp.zeros(capacity, jnp.float32).at[row].add(points[:, axis], mode="drop")
+        mean = mean.at[:, axis].set(total / jnp.maximum(count, 1.0))
+    return MeanPoints(mean, count > 0, jnp.maximum(rank[-1] + 1 - capacity, 0))

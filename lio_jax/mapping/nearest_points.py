@@ -1,0 +1,165 @@
+"""The k nearest points of a :class:`PointMap`, written for the loops that XLA makes of it on a CPU.
+
+All candidates of a query come from whole blocks. Each is one integer, its squared distance with the lowest
+bits replaced by its number, and a network of minima and maxima keeps the k smallest, without a sort.
+"""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float32, Int32
+
+from lio_jax.core.materialise import materialised
+from lio_jax.mapping.hash_slots import find_slots
+from lio_jax.mapping.point_map import EDGE, VOXELS, PointMap
+
+_NEAR = tuple(itertools.product((0, 1), repeat=3))
+_AROUND = tuple(itertools.product((-1, 0, 1), repeat=3))
+_CHUNK = 512
+"""Queries handled at a time: what they gather fits a core's cache, and padding costs little."""
+_WIDE_CHUNK = 128
+
+
+class Neighbours(eqx.Module):
+    """The n map points nearest each of k queries, in ascending distance; infinite where there are too few."""
+
+    x: Float32[Array, "n k"]
+    """m, in the anchored frame."""
+    y: Float32[Array, "n k"]
+    z: Float32[Array, "n k"]
+    squared_distance: Float32[Array, "n k"]
+    """m^2."""
+
+
+def nearest_points(
+    pmap: PointMap,
+    points: Float32[Array, "k 3"],
+    mask: Bool[Array, " k"],
+    anchor: Int32[Array, "3"],
+    voxel_size: Float32[Array, ""],
+    neighbours: int,
+) -> Neighbours:
+    """Return the map points nearest each query.
+
+    The eight blocks nearest a query are searched. Where a point outside of them might be nearer than the last
+    one found, all 27 blocks around it are: neighbours within a block's edge are always right, farther ones
+    are the nearest among those blocks. Distances that agree to a thousandth count as equal.
+
+    Args:
+        pmap: the map.
+        points: m, in the frame anchored at ``anchor``.
+        mask: which rows are real; those from the last real one on cost nothing.
+        anchor: block whose lower corner is the origin of ``points``.
+        voxel_size: edge length of a voxel, m.
+        neighbours: how many per query.
+    """
+    count = points.shape[0]
+    edge = EDGE * voxel_size
+    points = jnp.where(mask[:, None], points, 0.0)
+    search = _Search(pmap, points, anchor, edge, neighbours)
+    order = jnp.arange(count, dtype=jnp.int32)
+    found = Neighbours(*[jnp.full((neighbours, count), jnp.inf, jnp.float32)] * 4)
+    rows = jnp.max(jnp.where(mask, order + 1, 0))
+    found = search.over(found, order, rows, jnp.array(_NEAR, jnp.int32), _CHUNK)
+
+    scaled = points / edge
+    fraction = scaled - jnp.floor(scaled)
+    # along each axis the eight blocks end with the query's own block on one side, one later on the other
+    sure = edge * jnp.min(jnp.maximum(fraction, 1 - fraction), axis=-1)
+    unsure = mask & (found.squared_distance[-1] > sure**2)
+    rank = jnp.cumsum(unsure.astype(jnp.int32)) - 1
+    waiting = jnp.full(count, count, jnp.int32).at[jnp.where(unsure, rank, count)].set(order, mode="drop")
+    return search.over(found, waiting, rank[-1] + 1, jnp.array(_AROUND, jnp.int32), _WIDE_CHUNK)
+
+
+class _Search(eqx.Module):
+    """What all queries share."""
+
+    pmap: PointMap
+    points: Float32[Array, "k 3"]
+    anchor: Int32[Array, "3"]
+    edge: Float32[Array, ""]
+    neighbours: int = eqx.field(static=True)
+
+    def over(
+        self,
+        found: Neighbours,
+        order: Int32[Array, " k"],
+        rows: Int32[Array, ""],
+        blocks: Int32[Array, "b 3"],
+        chunk: int,
+    ) -> Neighbours:
+        """Search the given blocks for the first ``rows`` queries in ``order``; replace what was found."""
+        count = len(order)
+
+        def one_chunk(number: Array, found: Neighbours) -> Neighbours:
+            place = number * chunk + jnp.arange(chunk, dtype=jnp.int32)
+            row = jnp.where(place < rows, order[jnp.minimum(place, count - 1)], count)
+            new = self._among(self.points[jnp.minimum(row, count - 1)], blocks)
+            return jax.tree.map(lambda old, some: old.at[:, row].set(some, mode="drop"), found, new)
+
+        return jax.lax.fori_loop(0, (rows + chunk - 1) // chunk, one_chunk, found)
+
+    def _among(self, points: Float32[Array, "c 3"], blocks: Int32[Array, "b 3"]) -> Neighbours:
+        """Return the nearest points among blocks, given relative to the query's and its nearer side."""
+        scaled = points / self.edge
+        own = jnp.floor(scaled)
+        side = jnp.where(scaled - own > 0.5, 1, -1).astype(jnp.int32)
+        local = own.astype(jnp.int32) + blocks[:, None] * side
+        slot = materialised(find_slots(self.pmap.block, local + self.anchor))
+        bits = (len(blocks) * VOXELS - 1).bit_length()
+        distance_bits = jnp.int32(-1 << bits)
+
+        def with_block(number: Array, nearest: tuple[Array, ...]) -> tuple[Array, ...]:
+            held = slot[number]
+            away = points - self._centre(local[number])
+            rows = _take(self.pmap.point, jnp.maximum(held, 0))
+            squared = sum(
+                (rows[:, axis * VOXELS : (axis + 1) * VOXELS] - away[:, axis : axis + 1]) ** 2
+                for axis in range(3)
+            )
+            squared = jnp.where(held[:, None] >= 0, squared, jnp.inf)
+            key = jax.lax.bitcast_convert_type(squared, jnp.int32) & distance_bits
+            # queries side by side in memory: the network's loops run over them
+            keys = materialised((key | (number * VOXELS + jnp.arange(VOXELS, dtype=jnp.int32))).T)
+            for candidate in range(VOXELS):
+                nearest = _with_candidate(nearest, keys[candidate])
+            return nearest
+
+        none = jnp.full(len(points), jnp.iinfo(jnp.int32).max)
+        keys = jax.lax.fori_loop(0, len(blocks), with_block, (none,) * self.neighbours)
+        # with fewer candidates than neighbours the network's start is left, which is no candidate's number
+        number = jnp.minimum(jnp.stack(keys) & ~distance_bits, len(blocks) * VOXELS - 1)
+        which, voxel = number // VOXELS, number % VOXELS
+        column = jnp.arange(len(points))
+        chosen = _take(slot, (which, column))
+        centre = self._centre(_take(local, (which, column)))
+        coordinates = [
+            jnp.where(
+                chosen >= 0,
+                _take(self.pmap.point, (jnp.maximum(chosen, 0), axis * VOXELS + voxel)) + centre[..., axis],
+                jnp.inf,
+            )
+            for axis in range(3)
+        ]
+        x, y, z = coordinates
+        squared = (x - points[:, 0]) ** 2 + (y - points[:, 1]) ** 2 + (z - points[:, 2]) ** 2
+        return Neighbours(x, y, z, squared)
+
+    def _centre(self, local: Int32[Array, "*b 3"]) -> Float32[Array, "*b 3"]:
+        return (local.astype(jnp.float32) + 0.5) * self.edge
+
+
+def _with_candidate(nearest: tuple[Array, ...], key: Array) -> tuple[Array, ...]:
+    """Return the smallest keys in ascending order with one more candidate."""
+    kept = []
+    for smallest in nearest:
+        kept.append(jnp.minimum(smallest, key))
+        key = jnp.maximum(smallest, key)
+    return tuple(kept)
+
+
+def _take(table: Array, index: Array | tuple[Array, ...]) -> Array:
+    return table.at[index].get(mode="promise_in_bounds")

@@ -1,0 +1,223 @@
+"""FAST-LIO2: an iterated error-state filter on planes through the nearest points of an incremental map.
+
+scan -> every n-th -> deskew -> voxel mean -> iterated update (5-nn planes) -> insert -> cube of points
+imu  -> propagate ----/----------------------/
+
+Xu, Cai, He, Lin & Zhang, "FAST-LIO2: Fast direct LiDAR-inertial odometry", T-RO 2022. Its values are those of
+``recipe_settings("fast_lio2")``. Without inertial samples the velocity is taken as constant.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Float32, Int32
+
+from lio_jax.core.config import Config
+from lio_jax.core.error_state import Uncertain
+from lio_jax.core.params import Params
+from lio_jax.core.types import ImuBatch, NavState, Scan
+from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
+from lio_jax.estimation.nav_update import update_nav
+from lio_jax.estimation.pose_measurement import keep_observed, lidar_pose_jacobian
+from lio_jax.imu.path import deskew_along
+from lio_jax.lidar.voxel_mean import mean_per_voxel
+from lio_jax.mapping.point_map import EDGE, PointMap, empty_map, insert, move_cube
+from lio_jax.mapping.voxel_map import anchor_of
+from lio_jax.recipes.constant_velocity import (
+    carried_on,
+    mean_rate,
+    predicted_without_samples,
+    unlevelled_start,
+    until_its_middle,
+)
+from lio_jax.recipes.inertial_filter import (
+    Linearised,
+    levelled_start,
+    lidar_pose,
+    predicted,
+    registration_of,
+)
+from lio_jax.recipes.output import Output
+from lio_jax.registration.knn_planes import Association, associated, linearise, no_association
+from lio_jax.registration.scan_to_map import Frame
+
+
+class State(eqx.Module):
+    """What is carried from scan to scan."""
+
+    nav: NavState
+    """At the last scan's end."""
+    uncertain: Uncertain
+    """What the filter estimates: the navigation state at the last scan's end, and its covariance. Without
+    inertial samples that at the scan's middle, where an error of the velocity distorts the scan least."""
+    rate: Float[Array, "3"]
+    """Mean angular rate between the last two of those instants, rad/s, IMU frame."""
+    to_end: Float[Array, ""]
+    """From that instant to the scan's end, s."""
+    scans: Int32[Array, ""]
+    """Scans with points seen so far."""
+    map: PointMap
+
+
+def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
+    """Return the state before the first scan: at the world's origin.
+
+    Args:
+        config: static.
+        params: traced.
+        imu: samples of about a second up to the first scan's end; None: there are no inertial data.
+    """
+    start = unlevelled_start(params, None) if imu is None else levelled_start(params, imu, None)
+    return _before_the_first(config, start, jnp.zeros_like(start.nav.velocity))
+
+
+def restart(config: Config, params: Params, state: State, imu: ImuBatch | None = None) -> State:
+    """Return the state before the first scan once more, now with the velocity that ``state`` found.
+
+    A vehicle that is already moving distorts its first scan, which nothing can compensate until the second.
+    """
+    velocity = state.nav.velocity
+    start = unlevelled_start(params, velocity) if imu is None else levelled_start(params, imu, velocity)
+    return _before_the_first(config, start, state.rate)
+
+
+def _before_the_first(config: Config, start: Uncertain, rate: Float[Array, "3"]) -> State:
+    to_end = jnp.zeros_like(rate[0])
+    return State(start.nav, start, rate, to_end, jnp.int32(0), empty_map(config.map.capacity))
+
+
+def step(
+    config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch | None = None
+) -> tuple[State, Output]:
+    """Predict by the inertial samples, correct by the scan, add the scan to the map.
+
+    Args:
+        config: static.
+        params: traced.
+        state: donate it.
+        scan: padded sweep; ``scan.interval`` is the time since the last scan's end.
+        imu: samples around that time.
+    """
+    first = state.scans == 0
+    voxel_size = params.map.voxel_size.astype(jnp.float32)
+    with jax.named_scope("predict"):
+        if imu is None:
+            to_end = scan.duration.astype(state.to_end.dtype) / 2
+            scan = until_its_middle(scan, state.to_end)
+            prior, path = predicted_without_samples(params, state.uncertain, state.rate, scan, first)
+        else:
+            to_end = jnp.zeros_like(state.to_end)
+            prior, path = predicted(params, state.uncertain, scan, imu, first)
+        T_predicted = lidar_pose(prior.nav)
+    with jax.named_scope("thin"):
+        points, time, in_range = _filtered(config.fast_lio2.point_filter_num, params, scan)
+        points = deskew_along(path, prior.nav.T_imu_lidar, points, time)
+        spacing = params.registration.point_spacing.astype(jnp.float32)
+        thin = mean_per_voxel(points, in_range, spacing, config.lidar.registration_points)
+    with jax.named_scope("update"):
+        frame = Frame(*anchor_of(T_predicted.translation(), EDGE * params.map.voxel_size))
+        scan_match = _ScanMatch(state.map, thin.points, thin.mask, frame, params, config.knn.neighbours)
+        update = update_nav(
+            prior,
+            scan_match.measure,
+            max_iterations=config.registration.max_iterations,
+            rotation_tolerance=params.registration.rotation_tolerance,
+            translation_tolerance=params.registration.translation_tolerance,
+            first_aux=scan_match.before(prior.nav),
+        )
+        posterior: Uncertain = update.state
+        lost = (update.status > ITERATION_LIMIT) & ~first
+        T_world_lidar = lidar_pose(posterior.nav)
+    with jax.named_scope("insert"):
+        _, placed = frame.place(thin.points, T_world_lidar)
+        side = params.point_map.cube_side_length
+        margin = params.point_map.cube_margin * params.lidar.max_range
+        in_blocks = jnp.stack([side / 2, margin]).astype(jnp.float32) / (EDGE * voxel_size)
+        cube_map, added = insert(
+            state.map,
+            placed,
+            thin.mask & ~lost,
+            frame.anchor,
+            voxel_size,
+            in_blocks[0],
+            params.point_map.nearer_by.astype(jnp.float32),
+        )
+        # last, because whatever still reads the map beside it would make XLA copy the map
+        cube_map = move_cube(cube_map, frame.anchor, *in_blocks)
+
+    seen = jnp.any(thin.mask)
+    rate = jnp.where(first | lost, state.rate, mean_rate(state.uncertain.nav, posterior.nav, scan))
+    new_state = State(
+        nav=carried_on(posterior.nav, rate, to_end) if imu is None else posterior.nav,
+        uncertain=posterior,
+        rate=rate,
+        to_end=to_end,
+        scans=state.scans + seen.astype(jnp.int32),
+        map=cube_map,
+    )
+    return new_state, Output(
+        registration=registration_of(update, update.measurement.aux.linearised, T_world_lidar),
+        lost=lost,
+        nis=update.innovation.nis,
+        nis_dof=update.innovation.dof,
+        points=placed,
+        points_mask=thin.mask,
+        added=added.added,
+        origin=frame.origin,
+        thinned_away=thin.dropped,
+        map_dropped=added.dropped,
+        covariance=posterior.covariance,
+    )
+
+
+def _filtered(
+    every: int, params: Params, scan: Scan
+) -> tuple[Float32[Array, "n 3"], Float32[Array, " n"], Bool[Array, " n"]]:
+    """Return every n-th point, its time, and whether it lies between the blind radius and the far limit."""
+    points, time = scan.points[::every], scan.time[::every]
+    squared_range = jnp.sum(points**2, -1)
+    near, far = params.lidar.min_range.astype(jnp.float32), params.lidar.max_range.astype(jnp.float32)
+    mask = scan.mask[::every] & (squared_range > near**2) & (squared_range < far**2)
+    return jnp.where(mask[:, None], points, 0.0), time, mask
+
+
+class _Trial(eqx.Module):
+    """What one linearisation leaves to the next."""
+
+    association: Association
+    linearised: Linearised
+
+
+class _ScanMatch(eqx.Module):
+    """The scan against the map, as a measurement of the navigation state."""
+
+    map: PointMap
+    points: Float32[Array, "k 3"]
+    mask: Bool[Array, " k"]
+    frame: Frame
+    params: Params
+    neighbours: int = eqx.field(static=True)
+
+    def before(self, nav: NavState) -> _Trial:
+        """Return what the first linearisation starts from."""
+        nothing = Linearised.nothing(nav.velocity.dtype)
+        return _Trial(no_association(self.mask, lidar_pose(nav)), nothing)
+
+    def measure(self, nav: NavState, last: _Trial) -> Measurement:
+        """Find each point's plane, anew where the last step was large, and linearise at ``nav``."""
+        settings = self.params.registration
+        T = lidar_pose(nav)
+        association = associated(
+            last.association, self.map, self.points, self.mask, T, self.frame, self.params, self.neighbours
+        )
+        equations = linearise(association.planes, self.points, T, self.frame, self.params)
+        information, gradient, degenerate = keep_observed(
+            equations.hessian, equations.gradient, equations.arm_squared, settings.degeneracy_ratio
+        )
+        return Measurement(
+            information=settings.information_scale * information,
+            gradient=settings.information_scale * gradient,
+            jacobian=lidar_pose_jacobian(nav),
+            lost=equations.matches < settings.min_matches,
+            aux=_Trial(association, Linearised(equations, degenerate)),
+        )

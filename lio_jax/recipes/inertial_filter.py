@@ -1,0 +1,116 @@
+"""What the recipes with an error-state filter share: the start, the prediction and the form of the result."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from lio_jax.core.error_state import (
+    DOF,
+    EXTRINSIC_ROTATION,
+    EXTRINSIC_TRANSLATION,
+    GRAVITY,
+    POSITION,
+    ROTATION,
+    Uncertain,
+    sphere_basis,
+)
+from lio_jax.core.params import Params
+from lio_jax.core.types import ImuBatch, NavState, Scan
+from lio_jax.estimation.iterated_filter import Update
+from lio_jax.imu.initialise import initialise_at_rest
+from lio_jax.imu.path import Path
+from lio_jax.imu.rotation_integrals import skew
+from lio_jax.imu.strapdown import propagate
+from lio_jax.registration.scan_to_map import NormalEquations, Registration
+
+
+def levelled_start(params: Params, imu: ImuBatch, velocity: Float[Array, "3"] | None) -> Uncertain:
+    """Return the state at the world's origin, levelled by the samples.
+
+    Args:
+        params: traced.
+        imu: samples of about a second up to the first scan's end.
+        velocity: in world, m/s, where it is known; None: that of a vehicle at rest.
+    """
+    start = initialise_at_rest(
+        imu,
+        params.imu,
+        params.initial,
+        params.extrinsics.T_imu_lidar(),
+        params.extrinsics.time_offset,
+    )
+    nav = start.start.nav if velocity is None else dataclasses.replace(start.start.nav, velocity=velocity)
+    return held_at_lidar(Uncertain(nav, start.start.covariance))
+
+
+def held_at_lidar(state: Uncertain) -> Uncertain:
+    """Return a first state whose lidar pose is certain: it defines the map's frame.
+
+    If the extrinsic is off, then so is the pose of the IMU in that frame, and with it the direction in which
+    the accelerometer sees gravity: R Exp(a) R_il Exp(f) and p + R (b + a x t + d) stay what they are for an
+    error f, d of the extrinsic.
+    """
+    nav = state.nav
+    R_world_imu = nav.T_world_imu.rotation().as_matrix()
+    turn = -nav.T_imu_lidar.rotation().as_matrix()
+    carried = jnp.eye(DOF, dtype=state.covariance.dtype)
+    carried = carried.at[ROTATION, EXTRINSIC_ROTATION].set(turn)
+    carried = carried.at[POSITION, EXTRINSIC_TRANSLATION].set(-jnp.eye(3))
+    carried = carried.at[POSITION, EXTRINSIC_ROTATION].set(skew(nav.T_imu_lidar.translation()) @ turn)
+    carried = carried.at[GRAVITY, EXTRINSIC_ROTATION].set(sphere_basis(nav.gravity).T @ R_world_imu @ turn)
+    covariance = carried @ state.covariance @ carried.T
+    return Uncertain(nav, (covariance + covariance.T) / 2)
+
+
+def predicted(
+    params: Params, last: Uncertain, scan: Scan, imu: ImuBatch, first: Bool[Array, ""]
+) -> tuple[Uncertain, Path]:
+    """Return the state at the scan's end and the motion since the last scan's end."""
+    dtype = last.covariance.dtype
+    end = scan.duration.astype(dtype)
+    start = jnp.where(first, 0.0, end - scan.interval.astype(dtype))
+    moved, path = propagate(last, imu, params.imu, start, end)
+    # the first scan's end is the world's origin: its samples only deskew it
+    return jax.tree.map(lambda new, old: jnp.where(first, old, new), moved, last), path
+
+
+def lidar_pose(nav: NavState) -> jaxlie.SE3:
+    """Return T_world_lidar."""
+    return jaxlie.SE3((nav.T_world_imu @ nav.T_imu_lidar).wxyz_xyz)
+
+
+class Linearised(eqx.Module):
+    """The last linearisation of a scan match."""
+
+    equations: NormalEquations
+    degenerate: Bool[Array, " 6"]
+
+    @staticmethod
+    def nothing(dtype: jnp.dtype) -> "Linearised":
+        """Return a linearisation without matches."""
+        zero = jnp.zeros((), dtype)
+        equations = NormalEquations(
+            jnp.zeros((6, 6), dtype), jnp.zeros(6, dtype), jnp.int32(0), zero, zero, zero
+        )
+        return Linearised(equations, jnp.zeros(6, jnp.bool_))
+
+
+def registration_of(update: Update, last: Linearised, T_world_lidar: jaxlie.SE3) -> Registration:
+    """Return the update in the terms of a scan-to-map solve."""
+    equations = last.equations
+    to_body = jax.scipy.linalg.block_diag(*[T_world_lidar.rotation().as_matrix()] * 2)
+    return Registration(
+        T_world_lidar=T_world_lidar,
+        information=to_body.T @ update.measurement.information @ to_body,
+        degenerate=last.degenerate,
+        matches=equations.matches,
+        rmse=jnp.sqrt(
+            equations.squared_error / jnp.maximum(equations.weight, jnp.finfo(equations.weight.dtype).tiny)
+        ),
+        iterations=update.iterations,
+        status=update.status,
+    )

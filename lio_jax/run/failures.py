@@ -1,0 +1,164 @@
+"""What went wrong with a scan, and the likeliest cause, in words."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.settings import Settings
+from lio_jax.core.types import ImuBatch
+from lio_jax.estimation.iterated_filter import NOT_FINITE
+from lio_jax.imu.sampling import LONGEST_GAP
+from lio_jax.registration.scan_to_map import CONVERGED, ITERATION_LIMIT
+from lio_jax.run.directions import unobserved_directions
+
+_UNLIKELY_NIS = 22.46
+"""A consistent filter exceeds this once in a thousand scans: chi-square of the six directions of a pose."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known about one scan's estimate, on the host."""
+
+    points: int
+    """Of the scan as it was recorded."""
+    nav: Any
+    """Navigation state, numpy leaves."""
+    registration: Any
+    """The scan match, numpy leaves."""
+    lost: bool
+    """The pose is the prediction."""
+    nis: float
+    """Normalised innovation squared of the match; 0 where there was none."""
+    since_last_s: float
+    """From the last scan's end to this one's, s; 0 for the first."""
+    imu_gap_s: float | None
+    """Longest time without an inertial sample since then, s; None where none are used."""
+
+
+def failure_of(now: Evidence, before: Evidence | None, settings: Settings) -> str:
+    """Return what went wrong with a scan, one sentence for each thing, or nothing.
+
+    Speed and biases beyond ``params.limits`` are reported once, when they get there (LIO-SAM's
+    failureDetection), with what most likely caused it.
+
+    Args:
+        now: the scan.
+        before: the one before, if any.
+        settings: of the run.
+    """
+    limits = settings.values["limits"]
+    said = [_match_failure(now, settings)]
+    if now.since_last_s > limits["outage"]:
+        by = "constant velocity" if _gap(now) > LONGEST_GAP or now.imu_gap_s is None else "inertial samples"
+        said.append(f"no scan came for {now.since_last_s:.2f} s before it: {by} predicted the motion.")
+    for what, value, earlier, limit in _limited(now, before, limits):
+        if value > limits[limit] >= earlier:
+            said.append(
+                f"{what[0]} {value:.3g} {what[1]}, above params.limits.{limit}={limits[limit]:g}: "
+                f"{_cause(now)}."
+            )
+    first, *more = [sentence for sentence in said if sentence] or [""]
+    return " ".join([first, *(sentence[0].upper() + sentence[1:] for sentence in more)])
+
+
+def longest_gap(samples: ImuBatch, start: float, end: float) -> float:
+    """Return the longest time without a sample that touches a span, s.
+
+    Args:
+        samples: of the span and its neighbours, numpy leaves.
+        start: s, by the samples' clock.
+        end: s, likewise.
+    """
+    times = np.asarray(samples.time)[np.asarray(samples.mask)]
+    if not len(times):
+        return end - start
+    within = np.concatenate([[min(start, times[0])], times, [max(end, times[-1])]])
+    inner = (within[1:] > start) & (within[:-1] < end)
+    return float(np.max(np.diff(within)[inner], initial=0.0))
+
+
+def _match_failure(now: Evidence, settings: Settings) -> str:
+    found = now.registration
+    if now.points == 0:
+        return "it holds no points; the pose is the prediction."
+    if found.status == NOT_FINITE:
+        return (
+            f"the update was not finite ({_not_finite(found)}); state and covariance are the prediction's, "
+            "the map was left alone."
+        )
+    if now.lost:
+        needed = settings.values["registration"]["min_matches"]
+        suspects = _suspects(now)
+        why = f" ({', '.join(suspects)})" if suspects else ""
+        return (
+            f"{int(found.matches)} points matched the map, {needed:g} are needed{why}; "
+            "the pose is the prediction."
+        )
+    if found.status == ITERATION_LIMIT:
+        limit = settings.config.registration.max_iterations
+        return f"registration did not converge in {limit} iterations; its last pose was kept."
+    # too few matches without being lost: the scan that starts the map
+    if found.status == CONVERGED and (weak := int(found.degenerate.sum())):
+        words = ", ".join(unobserved_directions(found, now.nav))
+        return f"the scene leaves {weak} of 6 directions unobserved ({words}); there the prediction was kept."
+    return ""
+
+
+def _not_finite(found: Any) -> str:
+    sums = (found.information, found.rmse)
+    if all(np.isfinite(leaf).all() for leaf in sums):
+        return "the filter's covariance overflowed"
+    return f"the equations of its {int(found.matches)} matches hold NaN or infinity"
+
+
+def _limited(
+    now: Evidence, before: Evidence | None, limits: dict[str, Any]
+) -> list[tuple[tuple[str, str], float, float, str]]:
+    """Return what is limited: its words, now, before, and the limit's name."""
+    watched = (
+        (("the speed reached", "m/s"), "velocity", "speed"),
+        (("the gyroscope's bias reached", "rad/s"), "gyro_bias", "gyro_bias"),
+        (("the accelerometer's bias reached", "m/s^2"), "accel_bias", "accel_bias"),
+    )
+    rows = []
+    for words, leaf, limit in watched:
+        value = float(np.linalg.norm(getattr(now.nav, leaf)))
+        earlier = float(np.linalg.norm(getattr(before.nav, leaf))) if before else 0.0
+        rows.append((words, value, earlier, limit))
+    return rows
+
+
+def _cause(now: Evidence) -> str:
+    """Return what most likely drove the estimate there."""
+    suspects = _suspects(now) + ["the scan was not matched"] * now.lost
+    if suspects:
+        return f"likely because {' and '.join(suspects)}"
+    return (
+        f"no gap, unobserved direction or contradiction (residual {float(now.registration.rmse):.2f} m) "
+        "explains it; raise the limit if it is true, else check the IMU's units and axes"
+    )
+
+
+def _suspects(now: Evidence) -> list[str]:
+    found = now.registration
+    suspects = []
+    if _gap(now) > LONGEST_GAP:
+        suspects.append(f"there was no inertial sample for {_gap(now):.2f} s")
+    if now.lost:
+        return suspects
+    if found.degenerate.any():
+        words = ", ".join(unobserved_directions(found, now.nav))
+        suspects.append(f"the scene does not constrain the pose {words}")
+    if now.nis > _UNLIKELY_NIS:
+        biases: NDArray = np.concatenate([now.nav.gyro_bias, now.nav.accel_bias])
+        suspects.append(
+            f"the scan contradicts the prediction (NIS {now.nis:.0f}, residual {float(found.rmse):.2f} m, "
+            f"biases {np.linalg.norm(biases[:3]):.2g} rad/s and {np.linalg.norm(biases[3:]):.2g} m/s^2)"
+        )
+    return suspects
+
+
+def _gap(now: Evidence) -> float:
+    return now.imu_gap_s or 0.0
