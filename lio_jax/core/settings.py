@@ -144,6 +144,8 @@ def with_overrides(settings: Settings, assignments: list[str] | tuple[str, ...])
             raise UsageError(
                 f"--set {assignment}: write it as path=value, for example config.map.capacity=65536."
             )
+        if path.strip() == "recipe":
+            raise UsageError("--set recipe: choose the recipe by --recipe, because it brings its own values.")
         try:
             parsed = yaml.safe_load(value)
         except yaml.YAMLError:

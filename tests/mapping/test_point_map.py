@@ -19,7 +19,7 @@ _move = jax.jit(move_cube)
 
 
 def put(pmap: PointMap, points, anchor=(0, 0, 0), mask=None, half_side=WIDE, nearer_by=0.0):
-    """Insert points given in the frame anchored at ``anchor``; return the map, which were added, how many not."""
+    """Insert points of the frame anchored at ``anchor``: the map, which were added, how many had no room."""
     count = len(points)
     mask = np.ones(count, bool) if mask is None else np.asarray(mask)
     rows = np.zeros((SIZE, 3), np.float32)
@@ -104,8 +104,8 @@ def test_the_same_points_again_add_nothing():
 @pytest.mark.parametrize(("gain", "taken"), [(0.04, False), (0.06, True)])
 def test_a_point_takes_over_only_if_it_is_nearer_by_more_than_said(gain, taken):
     centre = np.full(3, VOXEL / 2)
-    pmap, _, _ = put(empty_map(64), [centre + [0.15, 0, 0]], nearer_by=0.05)
-    pmap, added, _ = put(pmap, [centre + [0.15 - gain, 0, 0]], nearer_by=0.05)
+    pmap, _, _ = put(empty_map(64), np.array([[0.15, 0, 0]]) + centre, nearer_by=0.05)
+    pmap, added, _ = put(pmap, np.array([[0.15 - gain, 0, 0]]) + centre, nearer_by=0.05)
     assert added[0] == taken
     assert len(held(pmap)) == 1
 
@@ -155,7 +155,7 @@ def test_a_full_table_says_what_it_dropped_and_keeps_what_it_has():
     pmap, _, first = put(empty_map(16), points)
     assert first > 0
     before = by_place(held(pmap))
-    pmap, added, dropped = put(pmap, cloud(600, 4.0, seed=8) + np.float32(30.0))
+    pmap, _, dropped = put(pmap, cloud(600, 4.0, seed=8) + np.float32(30.0))
     assert dropped > 0
     assert {tuple(p) for p in before.tolist()} <= {tuple(p) for p in held(pmap).tolist()}
 
@@ -186,7 +186,7 @@ def test_near_a_face_the_cube_moves_along_that_axis_and_what_falls_out_is_delete
 
 
 def test_points_outside_the_cube_are_left_out():
-    pmap, added, dropped = put(empty_map(64), [[0.1, 0.1, 0.1], [8.0, 0.1, 0.1]], half_side=3.0)
+    _, added, dropped = put(empty_map(64), [[0.1, 0.1, 0.1], [8.0, 0.1, 0.1]], half_side=3.0)
     assert added.tolist() == [True, False]
     assert dropped == 0
 
