@@ -90,7 +90,7 @@ def _run_into(
         recording = None
         if settings.config.output.recording:
             recording = stack.enter_context(Recording(out / "recording.rrd", total))
-            observers.append(RecordingObserver(recording, settings.config.lidar.insertion_points))
+            observers.append(RecordingObserver(recording))
         bar = stack.enter_context(tqdm(total=total, unit="scan", disable=None, leave=False))
         observers.append(lambda tracked, scan_ms: _advance(bar))
         result = run_sequence(sequence, settings, out, start, count, observers)
@@ -123,16 +123,16 @@ def _warn(sentences: list[str]) -> None:
 class RecordingObserver:
     """Writes every scan, thinned, into a recording."""
 
-    def __init__(self, recording: Recording, capacity: int) -> None:
+    def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self._stride = max(1, capacity // _RECORDED_POINTS)
 
     def __call__(self, tracked: Tracked, scan_ms: float) -> None:
         """Log the motion-compensated scan at its pose."""
         output, registration = tracked.output, tracked.output.registration
         T_world_lidar = tracked.T_world_imu @ np.asarray(tracked.nav.T_imu_lidar.as_matrix())
-        mask = np.asarray(output.points_mask)[:: self._stride]
-        points = np.asarray(output.points)[:: self._stride][mask]
+        points = np.asarray(output.points)
+        kept = slice(None, None, max(1, len(points) // _RECORDED_POINTS))
+        points = points[kept][np.asarray(output.points_mask)[kept]]
         offset = np.asarray(output.origin) - T_world_lidar[:3, 3]
         in_lidar = ((points + offset) @ T_world_lidar[:3, :3]).astype(np.float32)
         self._recording.log_scan(tracked.index, tracked.stamp_ns, in_lidar, T_world_lidar)
