@@ -67,7 +67,7 @@ def os1_128() -> SpinningLidar:
 def livox() -> RosetteLidar:
     """Return an Avia-like sensor: 70.4 x 77.2 deg, six lines, 240,000 rays a second, never the same sweep.
 
-    The prisms' rates are a choice of this package (Livox does not publish them): 100 s without repetition.
+    The prisms' rates are a choice of this package (no published ones were found): 100 s without repetition.
     """
     lines = 6
     fan = np.deg2rad(np.linspace(-3.4, 3.4, lines))
