@@ -38,7 +38,8 @@ from lio_jax.recipes.inertial_filter import (
     registration_of,
 )
 from lio_jax.recipes.output import Output
-from lio_jax.registration.knn_planes import Association, associated, linearise, no_association
+from lio_jax.registration.association import Association, associated, no_association
+from lio_jax.registration.knn_planes import Planes, associate, linearise, no_planes
 from lio_jax.registration.scan_to_map import Frame
 
 
@@ -184,7 +185,7 @@ def _filtered(
 class _Trial(eqx.Module):
     """What one linearisation leaves to the next."""
 
-    association: Association
+    association: Association[Planes]
     linearised: Linearised
 
 
@@ -201,16 +202,21 @@ class _ScanMatch(eqx.Module):
     def before(self, nav: NavState) -> _Trial:
         """Return what the first linearisation starts from."""
         nothing = Linearised.nothing(nav.velocity.dtype)
-        return _Trial(no_association(self.mask, lidar_pose(nav)), nothing)
+        return _Trial(no_association(no_planes(self.mask), lidar_pose(nav)), nothing)
 
     def measure(self, nav: NavState, last: _Trial) -> Measurement:
         """Find each point's plane, anew where the last step was large, and linearise at ``nav``."""
         settings = self.params.registration
         T = lidar_pose(nav)
         association = associated(
-            last.association, self.map, self.points, self.mask, T, self.frame, self.params, self.neighbours
+            last.association,
+            lambda: associate(self.map, self.points, self.mask, T, self.frame, self.params, self.neighbours),
+            self.points,
+            self.mask,
+            T,
+            settings.reassociation_distance,
         )
-        equations = linearise(association.planes, self.points, T, self.frame, self.params)
+        equations = linearise(association.found, self.points, T, self.frame, self.params)
         information, gradient, degenerate = keep_observed(
             equations.hessian, equations.gradient, equations.arm_squared, settings.degeneracy_ratio
         )

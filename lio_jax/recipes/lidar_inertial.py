@@ -28,7 +28,8 @@ from lio_jax.recipes.inertial_filter import (
     registration_of,
 )
 from lio_jax.recipes.output import Output
-from lio_jax.registration.scan_to_map import Association, Frame, associated, linearise, no_association
+from lio_jax.registration.association import Association, associated, no_association
+from lio_jax.registration.scan_to_map import Frame, Matches, associate, linearise, no_matches
 
 
 class State(eqx.Module):
@@ -135,7 +136,7 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
 class _Trial(eqx.Module):
     """What one linearisation leaves to the next."""
 
-    association: Association
+    association: Association[Matches]
     iteration: Int32[Array, ""]
     linearised: Linearised
 
@@ -153,7 +154,7 @@ class _ScanMatch(eqx.Module):
     def before(self, T_world_lidar: jaxlie.SE3) -> _Trial:
         """Return what the first linearisation starts from."""
         nothing = Linearised.nothing(T_world_lidar.wxyz_xyz.dtype)
-        return _Trial(no_association(self.mask, T_world_lidar), jnp.int32(0), nothing)
+        return _Trial(no_association(no_matches(self.mask), T_world_lidar), jnp.int32(0), nothing)
 
     def measure(self, nav: NavState, last: _Trial) -> Measurement:
         """Match and linearise at ``nav``; the kernel opens and narrows as in :func:`register`."""
@@ -161,10 +162,15 @@ class _ScanMatch(eqx.Module):
         T = lidar_pose(nav)
         opening = self.prediction_error * 0.5 ** last.iteration.astype(self.prediction_error.dtype)
         association = associated(
-            last.association, self.map, self.points, self.mask, T, self.frame, self.params
+            last.association,
+            lambda: associate(self.map, self.points, self.mask, T, self.frame, self.params),
+            self.points,
+            self.mask,
+            T,
+            settings.reassociation_distance,
         )
         equations = linearise(
-            association.matches, self.points, T, self.frame, settings.kernel + opening, self.params
+            association.found, self.points, T, self.frame, settings.kernel + opening, self.params
         )
         information, gradient, degenerate = keep_observed(
             equations.hessian, equations.gradient, equations.arm_squared, settings.degeneracy_ratio

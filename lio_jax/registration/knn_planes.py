@@ -1,10 +1,9 @@
 """Scan to map by planes through nearest neighbours (FAST-LIO2): association, fit and normal equations."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float, Float32
+from jaxtyping import Array, Bool, Float32
 
 from lio_jax.core.geometry import eigenvalues_and_normal3
 from lio_jax.core.materialise import materialised
@@ -26,48 +25,10 @@ class Planes(eqx.Module):
     valid: Bool[Array, " k"]
 
 
-class Association(eqx.Module):
-    """The planes of a scan and the pose at which they were found."""
-
-    planes: Planes
-    T_world_lidar: jaxlie.SE3
-    arm: Float[Array, ""]
-    """Root mean square distance of the points from the sensor, m: what a turn moves them by."""
-
-
-def no_association(mask: Bool[Array, " k"], T_world_lidar: jaxlie.SE3) -> Association:
-    """Return an association that every pose is too far from."""
+def no_planes(mask: Bool[Array, " k"]) -> Planes:
+    """Return planes of none of the points."""
     zeros = jnp.zeros((*mask.shape, 3), jnp.float32)
-    nowhere = jaxlie.SE3.from_rotation_and_translation(
-        T_world_lidar.rotation(), jnp.full_like(T_world_lidar.translation(), jnp.inf)
-    )
-    planes = Planes(zeros, zeros[:, 0], jnp.zeros_like(mask))
-    return Association(planes, nowhere, jnp.zeros((), nowhere.wxyz_xyz.dtype))
-
-
-def associated(
-    last: Association,
-    pmap: PointMap,
-    points: Float32[Array, "k 3"],
-    mask: Bool[Array, " k"],
-    T_world_lidar: jaxlie.SE3,
-    frame: Frame,
-    params: Params,
-    neighbours: int,
-) -> Association:
-    """Return the last association as long as the scan stays near it, else that at ``T_world_lidar``."""
-    turn = T_world_lidar.rotation().as_matrix() - last.T_world_lidar.rotation().as_matrix()
-    move = T_world_lidar.translation() - last.T_world_lidar.translation()
-    # |R - R'| = sqrt(2) |angle| for small angles, in Frobenius' norm
-    moved = jnp.linalg.norm(move) + last.arm * jnp.linalg.norm(turn) / jnp.sqrt(2.0)
-
-    def anew() -> Association:
-        squared = jnp.where(mask, jnp.sum(points**2, -1), 0.0)
-        arm = jnp.sqrt(jnp.sum(squared) / jnp.maximum(jnp.sum(mask), 1)).astype(last.arm.dtype)
-        planes = associate(pmap, points, mask, T_world_lidar, frame, params, neighbours)
-        return Association(planes, T_world_lidar, arm)
-
-    return jax.lax.cond(moved > params.registration.reassociation_distance, anew, lambda: last)
+    return Planes(zeros, zeros[:, 0], jnp.zeros_like(mask))
 
 
 def associate(

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.params import Params
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, query_nearest
+from lio_jax.registration.association import associated, no_association
 
 CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES = 0, 1, 2
 """Status codes of a solve."""
@@ -107,46 +108,10 @@ def associate(
     return Matches(near.mean, near.normal, jnp.where(used, known[:, 0] - known[:, 1], 0.0), used)
 
 
-class Association(eqx.Module):
-    """The matches of a scan and the pose at which they were found."""
-
-    matches: Matches
-    T_world_lidar: jaxlie.SE3
-    arm: Float[Array, ""]
-    """Root mean square distance of the points from the sensor, m: what a turn moves them by."""
-
-
-def no_association(mask: Bool[Array, " k"], T_world_lidar: jaxlie.SE3) -> Association:
-    """Return an association that every pose is too far from."""
+def no_matches(mask: Bool[Array, " k"]) -> Matches:
+    """Return matches of none of the points."""
     zeros = jnp.zeros((*mask.shape, 3), jnp.float32)
-    nowhere = jaxlie.SE3.from_rotation_and_translation(
-        T_world_lidar.rotation(), jnp.full_like(T_world_lidar.translation(), jnp.inf)
-    )
-    matches = Matches(zeros, zeros, zeros[:, 0], jnp.zeros_like(mask))
-    return Association(matches, nowhere, jnp.zeros((), nowhere.wxyz_xyz.dtype))
-
-
-def associated(
-    last: Association,
-    vmap: VoxelMap,
-    points: Float32[Array, "k 3"],
-    mask: Bool[Array, " k"],
-    T_world_lidar: jaxlie.SE3,
-    frame: Frame,
-    params: Params,
-) -> Association:
-    """Return the last association as long as the scan stays near it, else that at ``T_world_lidar``."""
-    turn = T_world_lidar.rotation().as_matrix() - last.T_world_lidar.rotation().as_matrix()
-    move = T_world_lidar.translation() - last.T_world_lidar.translation()
-    # |R - R'| = sqrt(2) |angle| for small angles, in Frobenius' norm
-    moved = jnp.linalg.norm(move) + last.arm * jnp.linalg.norm(turn) / jnp.sqrt(2.0)
-
-    def anew() -> Association:
-        squared = jnp.where(mask, jnp.sum(points**2, -1), 0.0)
-        arm = jnp.sqrt(jnp.sum(squared) / jnp.maximum(jnp.sum(mask), 1)).astype(last.arm.dtype)
-        return Association(associate(vmap, points, mask, T_world_lidar, frame, params), T_world_lidar, arm)
-
-    return jax.lax.cond(moved > params.registration.reassociation_distance, anew, lambda: last)
+    return Matches(zeros, zeros, zeros[:, 0], jnp.zeros_like(mask))
 
 
 def linearise(
@@ -233,9 +198,16 @@ def register(
     def iterate(carry: tuple) -> tuple:
         T, iteration, _, association, _, _ = carry
         points = points_at(T)
-        association = associated(association, vmap, points, mask, T, frame, params)
+        association = associated(
+            association,
+            lambda: associate(vmap, points, mask, T, frame, params),
+            points,
+            mask,
+            T,
+            settings.reassociation_distance,
+        )
         kernel = settings.kernel + opening(iteration)
-        equations = linearise(association.matches, points, T, frame, kernel, params)
+        equations = linearise(association.found, points, T, frame, kernel, params)
         step, degenerate = _solve_observable(equations, settings.degeneracy_ratio)
         turn, move = step[:3], step[3:]
         T = jaxlie.SE3.from_rotation_and_translation(
@@ -250,7 +222,7 @@ def register(
     def unfinished(carry: tuple) -> Array:
         return (carry[1] < max_iterations) & ~carry[2]
 
-    start = (T_world_lidar, jnp.int32(0), jnp.array(False), no_association(mask, T_world_lidar))
+    start = (T_world_lidar, jnp.int32(0), jnp.array(False), no_association(no_matches(mask), T_world_lidar))
     shapes = jax.eval_shape(lambda: iterate((*start, None, None))[4:])
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     T, iterations, done, _, equations, degenerate = jax.lax.while_loop(unfinished, iterate, (*start, *blank))

@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 from lio_jax.core.settings import recipe_settings, with_overrides
 from lio_jax.mapping.point_map import EDGE, empty_map
 from lio_jax.mapping.voxel_map import anchor_of
-from lio_jax.registration.knn_planes import associate, associated, fit_planes, linearise, no_association
+from lio_jax.registration.association import associated, no_association
+from lio_jax.registration.knn_planes import associate, fit_planes, linearise, no_planes
 from lio_jax.registration.scan_to_map import Frame
 from tests.mapping.test_nearest_points import street
 from tests.mapping.test_point_map import held, put
@@ -22,7 +23,20 @@ POSE = jaxlie.SE3.from_rotation_and_translation(
 )
 FRAME = Frame(*anchor_of(POSE.translation(), EDGE * PARAMS.map.voxel_size))
 _associate = jax.jit(associate, static_argnums=6)
-_associated = jax.jit(associated, static_argnums=7)
+
+
+@jax.jit
+def _associated(last, pmap, points, mask, T, params):
+    return associated(
+        last,
+        lambda: associate(pmap, points, mask, T, FRAME, params, 5),
+        points,
+        mask,
+        T,
+        params.registration.reassociation_distance,
+    )
+
+
 _linearise = jax.jit(linearise)
 _fit = jax.jit(fit_planes)
 
@@ -188,7 +202,7 @@ def test_normal_equations_are_those_of_the_residuals(scene, scan):
 def test_planes_are_kept_until_the_scan_has_moved_away(scene, scan):
     pmap, _ = scene
     points, mask = scan
-    first = _associated(no_association(mask, POSE), pmap, points, mask, POSE, FRAME, PARAMS, 5)
+    first = _associated(no_association(no_planes(mask), POSE), pmap, points, mask, POSE, PARAMS)
     limit = float(PARAMS.registration.reassociation_distance)
 
     def moved(metres: float) -> jaxlie.SE3:
@@ -196,11 +210,11 @@ def test_planes_are_kept_until_the_scan_has_moved_away(scene, scan):
             POSE.rotation(), POSE.translation() + jnp.array([metres, 0.0, 0.0])
         )
 
-    near = _associated(first, pmap, points, mask, moved(0.9 * limit), FRAME, PARAMS, 5)
-    far = _associated(first, pmap, points, mask, moved(30 * limit), FRAME, PARAMS, 5)
-    np.testing.assert_array_equal(near.planes.offset, first.planes.offset)
-    assert not np.array_equal(far.planes.offset, first.planes.offset)
-    assert int(np.asarray(first.planes.valid).sum()) > 100
+    near = _associated(first, pmap, points, mask, moved(0.9 * limit), PARAMS)
+    far = _associated(first, pmap, points, mask, moved(30 * limit), PARAMS)
+    np.testing.assert_array_equal(near.found.offset, first.found.offset)
+    assert not np.array_equal(far.found.offset, first.found.offset)
+    assert int(np.asarray(first.found.valid).sum()) > 100
 
 
 @pytest.mark.parametrize("filler", [np.nan, np.inf, 1e30])
