@@ -249,6 +249,17 @@ def values_from_params(params: Params) -> dict[str, dict[str, Any]]:
     }
 
 
+DIFFERENTIABLE = (
+    *(f"imu.{name}" for name in DEFAULTS["imu"]),
+    *(f"initial.{name}" for name in DEFAULTS["initial"]),
+    "lidar.range_sigma",
+    "lidar.angle_sigma",
+    "registration.kernel",
+    "registration.information_scale",
+    *(f"extrinsics.{name}" for name in DEFAULTS["extrinsics"]),
+)
+"""Leaves with a derivative. The others choose: which points, which voxels, when to stop, what to report."""
+
 _ANY_SIGN = {"extrinsics.translation", "extrinsics.time_offset"}
 _MAY_BE_ZERO = {
     *(f"initial.{name}" for name in DEFAULTS["initial"]),

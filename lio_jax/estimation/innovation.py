@@ -42,13 +42,42 @@ def square_root_information(
     Eigenvalues below the rounding error of the largest one, and negative ones, count as zero, and the
     gradient's part along their directions is dropped.
     """
+    root, residual, values, _ = _square_root(information, gradient)
+    return root, residual, values
+
+
+@jax.custom_jvp
+def _square_root(information: Array, gradient: Array) -> tuple[Array, Array, Array, Array]:
+    """Return C, u, the eigenvalues and the eigenvectors."""
     values, vectors = jnp.linalg.eigh(information)
     limits = jnp.finfo(values.dtype)
     smallest = jnp.maximum(values.shape[0] * limits.eps * values[-1], limits.tiny)
     values = jnp.where(values > smallest, values, 0.0)
     root = jnp.sqrt(values)
     along = vectors.T @ gradient
-    return vectors * root, jnp.where(root > 0, along / jnp.where(root > 0, root, 1.0), 0.0), values
+    return vectors * root, jnp.where(root > 0, along / jnp.where(root > 0, root, 1.0), 0.0), values, vectors
+
+
+@_square_root.defjvp
+def _square_root_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+    """Differentiate the root up to a turn C -> CQ, which no statistic of the innovation can see.
+
+    The eigenvectors' own derivative, infinite where eigenvalues meet, is not needed: with the pseudoinverse
+    C+ and the projector N on what is not observed, dC = (CC+/2 + N) dA C+' satisfies dA = dC C' + C dC'
+    for every dA that keeps the rank.
+    """
+    values = _square_root(*primals)
+    _, residual, eigenvalues, vectors = values
+    observed = eigenvalues > 0
+    inverse = jnp.where(observed, 1 / jnp.sqrt(jnp.where(observed, eigenvalues, 1.0)), 0.0)
+    pseudoinverse = inverse[:, None] * vectors.T
+    share = vectors * jnp.where(observed, 0.5, 1.0)
+    information_dot, gradient_dot = tangents
+    along = vectors.T @ information_dot
+    root_dot = share @ (along @ pseudoinverse.T)
+    residual_dot = pseudoinverse @ (gradient_dot - root_dot @ residual)
+    eigenvalues_dot = jnp.where(observed, jnp.sum(along * vectors.T, 1), 0.0)
+    return values, (root_dot, residual_dot, eigenvalues_dot, jnp.zeros_like(vectors))
 
 
 def innovation_of(

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
+from lio_jax.core.implicit import Problem, Solution, implicit
 from lio_jax.estimation.innovation import Innovation, innovation_of, square_root_information
 
 CONVERGED, ITERATION_LIMIT, LOST, NOT_FINITE = 0, 1, 2, 3
@@ -27,8 +28,6 @@ class Measurement(eqx.Module):
     """Sum of H' R^-1 H over the residuals; directions without information are allowed."""
     gradient: Float[Array, " k"]
     """Sum of H' R^-1 r: it lies in the range of ``information``."""
-    jacobian: Float[Array, "k d"]
-    """Derivative of the quantity with respect to the error at the state that was measured."""
     lost: Bool[Array, ""]
     """The measurement is of no use: keep the prior."""
     aux: Any = None
@@ -55,12 +54,14 @@ def iterated_update(
     state: State,
     covariance: Float[Array, "d d"],
     measure: Callable[..., Measurement],
+    jacobian: Callable[[State], Float[Array, "k d"]],
     retract: Callable[[State, Float[Array, " d"]], State],
     local: Callable[[State, State], Float[Array, " d"]],
     *,
     max_iterations: int,
     tolerance: Float[Array, " d"],
     first_aux: Any = None,
+    again: Callable[..., Measurement] | None = None,
     reset: Callable[[State, Float[Array, " d"]], Float[Array, "d d"]] | None = None,
 ) -> Update:
     """Return the state that best agrees with the prior and the measurement together, and its covariance.
@@ -77,71 +78,141 @@ def iterated_update(
     whose only inverse is k by k: neither P nor A needs one, what P holds as certain stays put to the last
     bit, and directions without information are left alone. The posterior is in Joseph's form.
 
+    Derivatives are those of the converged solution, choices held (:mod:`lio_jax.core.implicit`); where the
+    status is ITERATION_LIMIT they are not to be trusted. ``measure`` and ``again`` must be pytrees, such as
+    methods of an :class:`equinox.Module`, if what they hold is to be differentiated.
+
     Args:
         state: prior mean.
         covariance: of the prior's error, positive semidefinite.
         measure: ``state -> Measurement`` linearised there; called at each iterate, so it may re-associate.
             With ``first_aux`` it is ``(state, aux) -> Measurement`` and also gets what the last linearisation
             left in ``aux``, for instance associations to use once more.
+        jacobian: ``state ->`` derivative of the measured quantity with respect to the error at the state. The
+            measurement depends on the state through that quantity alone.
         retract: ``(state, error) -> state``.
         local: its inverse, ``(state, other) -> error``.
         max_iterations: bound of the loop, at least 1.
         tolerance: converged when each component's step is at most this; infinite for those not to look at.
         first_aux: the first linearisation's ``aux``, of the structure that every one returns.
+        again: ``(state, aux) ->`` the linearisation that left ``aux``, at another state but with the same
+            choices: its derivative stands for the converged iteration's. ``measure`` where not given.
         reset: ``(state, e) ->`` derivative of ``local(retract(state, e), retract(state, e + w))`` with
             respect to w at zero; by automatic differentiation where not given.
     """
     reset_at = reset or _reset_by_differentiation(retract, local)
+    if first_aux is None:
+        measure, again = _WithoutAux(measure), again and _WithoutAux(again)
+    again = again or measure
 
-    def linearise(moved: State, aux: Any) -> Measurement:
-        return measure(moved) if first_aux is None else measure(moved, aux)
+    def jacobian_at(origin: State, error: Array) -> Array:
+        return jacobian(retract(origin, error)) @ reset_at(origin, error)
 
-    def iterate(carry: tuple) -> tuple:
-        error, iteration, _, _, _, last, *_ = carry
-        measured = linearise(retract(state, error), last.aux)
+    def blend(measured: Measurement, prior: _Prior, error: Array) -> _Blend:
         root, residual, values = square_root_information(measured.information, measured.gradient)
-        H = root.T @ (measured.jacobian @ reset_at(state, error))
-        PH = covariance @ H.T
-        innovation = innovation_of(H @ PH, residual - H @ error, values)
-        following = -PH @ innovation.solve(innovation.whitened[:, None])[:, 0]
-        lost = measured.lost | ~jnp.all(jnp.isfinite(following))
-        done = lost | (measured.settled & jnp.all(jnp.abs(following - error) <= tolerance))
-        return following, iteration + 1, done, lost, innovation, measured, H, PH
+        H = root.T @ jacobian_at(prior.state, error)
+        PH = prior.covariance @ H.T
+        return _Blend(measured, H, PH, innovation_of(H @ PH, residual - H @ error, values))
 
-    def unfinished(carry: tuple) -> Array:
-        return (carry[1] < max_iterations) & ~carry[2]
+    def solve(inputs: tuple) -> Solution:
+        prior, measure, _, first_aux, tolerance = inputs
 
-    error = jnp.zeros(covariance.shape[0], covariance.dtype)
-    blank = _blank(jax.eval_shape(lambda: linearise(state, first_aux)))
-    measured = blank if first_aux is None else eqx.tree_at(lambda blank: blank.aux, blank, first_aux)
-    scalars = (error, jnp.int32(0), jnp.array(False), jnp.array(False))
-    shapes = jax.eval_shape(lambda: iterate((*scalars, None, measured, None, None)))
-    start = (*scalars, _blank(shapes[4]), measured, *_blank(shapes[6:]))
-    final: tuple = jax.lax.while_loop(unfinished, iterate, start)
-    error, iterations, done, lost, innovation, measured, H, PH = final
+        def iterate(carry: tuple) -> tuple:
+            error, iteration, _, _, last = carry
+            measured = measure(retract(prior.state, error), last.measured.aux)
+            blended = blend(measured, prior, error)
+            innovation = blended.innovation
+            following = -blended.PH @ innovation.solve(innovation.whitened[:, None])[:, 0]
+            lost = measured.lost | ~jnp.all(jnp.isfinite(following))
+            done = lost | (measured.settled & jnp.all(jnp.abs(following - error) <= tolerance))
+            return following, iteration + 1, done, lost, blended
 
+        def unfinished(carry: tuple) -> Array:
+            return (carry[1] < max_iterations) & ~carry[2]
+
+        error = jnp.zeros(covariance.shape[0], covariance.dtype)
+        measured = _blank(jax.eval_shape(lambda: measure(prior.state, first_aux)))
+        if first_aux is not None:
+            measured = eqx.tree_at(lambda blank: blank.aux, measured, first_aux)
+        blank = _blank(jax.eval_shape(lambda: blend(measured, prior, error)))
+        blank = eqx.tree_at(lambda blank: blank.measured, blank, measured)
+        start = (error, jnp.int32(0), jnp.array(False), jnp.array(False), blank)
+        error, iterations, done, lost, last = jax.lax.while_loop(unfinished, iterate, start)
+        return Solution(error, _Loop(last.measured.aux, iterations, done, lost), last)
+
+    def probe(error: Array, loop: _Loop, inputs: tuple) -> Measurement:
+        prior, _, again, *_ = inputs
+        return again(retract(prior.state, error), loop.aux)
+
+    def residual(error: Array, measured: Measurement, loop: _Loop, inputs: tuple) -> Array:
+        prior = inputs[0]
+        return error + prior.covariance @ (jacobian_at(prior.state, error).T @ measured.gradient)
+
+    def report(error: Array, measured: Measurement, loop: _Loop, inputs: tuple) -> _Blend:
+        return blend(measured, inputs[0], error)
+
+    def directions(error: Array, inputs: tuple) -> tuple[Array, Array]:
+        forth = jacobian_at(inputs[0].state, error)
+        return jnp.linalg.pinv(forth), forth
+
+    inputs = (_Prior(state, covariance), measure, again, first_aux, tolerance)
+    error, loop, last = implicit(Problem(solve, probe, residual, report, directions), inputs)
+    innovation = last.innovation
     G = reset_at(state, error)
-    gain = innovation.solve(PH.T).T
-    kept = G - (G @ gain) @ H
+    gain = innovation.solve(last.PH.T).T
+    kept = G - (G @ gain) @ last.H
     posterior = kept @ covariance @ kept.T + (G @ gain) @ (G @ gain).T
     finite = jnp.all(jnp.isfinite(error)) & jnp.all(jnp.isfinite(posterior))
-    lost = lost | ~finite
+    lost = loop.lost | ~finite
     idle = lost | (innovation.dof == 0)
     innovation = jax.tree.map(lambda leaf: jnp.where(idle, jnp.zeros_like(leaf), leaf), innovation)
 
     def unless_idle(new: Array, old: Array) -> Array:
         return jnp.where(idle, old, new)
 
-    status = jnp.where(done, CONVERGED, ITERATION_LIMIT)
+    status = jnp.where(loop.done, CONVERGED, ITERATION_LIMIT)
     status = jnp.where(lost, NOT_FINITE, status)
     return Update(
         state=jax.tree.map(unless_idle, retract(state, error), state),
         covariance=unless_idle((posterior + posterior.T) / 2, covariance),
         innovation=innovation,
-        measurement=measured,
-        iterations=iterations,
-        status=jnp.where(measured.lost, LOST, status).astype(jnp.int32),
+        measurement=last.measured,
+        iterations=loop.iterations,
+        status=jnp.where(last.measured.lost, LOST, status).astype(jnp.int32),
     )
+
+
+class _Prior(eqx.Module):
+    state: Any
+    covariance: Float[Array, "d d"]
+
+
+class _Blend(eqx.Module):
+    """A measurement set against the prior."""
+
+    measured: Measurement
+    H: Float[Array, "k d"]
+    """Of the whitened measurement by the error from the prior mean."""
+    PH: Float[Array, "d k"]
+    innovation: Innovation
+
+
+class _Loop(eqx.Module):
+    """How the iteration ended."""
+
+    aux: Any
+    iterations: Int32[Array, ""]
+    done: Bool[Array, ""]
+    lost: Bool[Array, ""]
+
+
+class _WithoutAux(eqx.Module):
+    """A measurement that does without what the last one left."""
+
+    measure: Callable[[Any], Measurement]
+
+    def __call__(self, state: Any, aux: Any) -> Measurement:
+        return self.measure(state)
 
 
 def _reset_by_differentiation(

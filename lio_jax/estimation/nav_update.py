@@ -21,6 +21,7 @@ from lio_jax.core.error_state import (
 )
 from lio_jax.core.types import NavState
 from lio_jax.estimation.iterated_filter import Measurement, Update, iterated_update
+from lio_jax.estimation.pose_measurement import lidar_pose_jacobian
 from lio_jax.imu.rotation_integrals import rotation_integrals
 
 
@@ -32,17 +33,18 @@ def update_nav(
     rotation_tolerance: Float[Array, ""],
     translation_tolerance: Float[Array, ""],
     first_aux: Any = None,
+    again: Callable[..., Measurement] | None = None,
 ) -> Update:
     """Return the iterated update of a navigation state; its ``state`` is an :class:`Uncertain`.
 
     Args:
         prior: predicted state.
-        measure: linearises the measurement with respect to the 24-dimensional error of the
-            :class:`NavState` it is given; see :func:`iterated_update`.
+        measure: linearises the measurement at the :class:`NavState` it is given with respect to the lidar's
+            pose, perturbed as in :func:`lidar_pose_jacobian`; see :func:`iterated_update`.
         max_iterations: bound of the loop, at least 1.
         rotation_tolerance: converged when no component of a step turns more than this, rad ...
         translation_tolerance: ... and none moves more than this, m.
-        first_aux: see :func:`iterated_update`.
+        first_aux: see :func:`iterated_update`; ``again`` likewise.
     """
     dtype = prior.covariance.dtype
     tolerance = jnp.full(DOF, jnp.inf, dtype)
@@ -51,11 +53,13 @@ def update_nav(
         prior.nav,
         prior.covariance,
         measure,
+        lidar_pose_jacobian,
         retract,
         local,
         max_iterations=max_iterations,
         tolerance=tolerance,
         first_aux=first_aux,
+        again=again,
         reset=reset_jacobian,
     )
     return update._replace(state=Uncertain(update.state, update.covariance))

@@ -1,5 +1,6 @@
 """The lidar's pose as a measurement of the navigation state."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
@@ -53,12 +54,48 @@ def keep_observed(
     """
     dtype = information.dtype
     scale = jnp.concatenate([jnp.full(3, 1.0) / jnp.sqrt(arm_squared + 1e-6), jnp.ones(3)]).astype(dtype)
-    values, vectors = jnp.linalg.eigh(scale[:, None] * information * scale)
-    degenerate = values <= jnp.maximum(degeneracy_ratio * values[-1], jnp.finfo(dtype).tiny)
-    unscaled = vectors / scale[:, None]
-    kept = (unscaled * jnp.where(degenerate, 0.0, values)) @ unscaled.T
-    along = jnp.where(degenerate, 0.0, vectors.T @ (scale * gradient))
-    return (kept + kept.T) / 2, unscaled @ along, degenerate
+    kept, along, degenerate = _observed(
+        scale[:, None] * information * scale, scale * gradient, degeneracy_ratio
+    )
+    kept = kept / (scale[:, None] * scale)
+    return (kept + kept.T) / 2, along / scale, degenerate
+
+
+@eqx.filter_custom_jvp
+def _observed(information: Array, gradient: Array, degeneracy_ratio: Array) -> tuple[Array, Array, Array]:
+    """Return the information and the gradient in the directions that are not degenerate, and which are."""
+    return _decomposed(information, gradient, degeneracy_ratio)[0]
+
+
+@_observed.def_jvp
+def _observed_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+    """Differentiate by the divided differences of eigenvalues (Daleckii & Krein 1965).
+
+    Only those between a kept and a dropped direction matter, and they can't vanish. Which directions are
+    dropped is a choice, without a derivative.
+    """
+    (kept, along, degenerate), values, vectors = _decomposed(*primals)
+    information_dot, gradient_dot = (
+        jnp.zeros_like(primal) if tangent is None else tangent
+        for primal, tangent in zip(primals[:2], tangents[:2], strict=True)
+    )
+    turned = vectors.T @ information_dot @ vectors
+    apart = degenerate[:, None] != degenerate
+    gap = jnp.where(apart, values[:, None] - values, 1.0)
+    strong = jnp.maximum(values[:, None], values)
+    kept_dot = jnp.where(apart, strong / jnp.abs(gap), ~degenerate[:, None] & ~degenerate) * turned
+    projector_dot = jnp.where(apart, 1 / jnp.abs(gap), 0.0) * turned
+    own = vectors.T @ primals[1]
+    along_dot = projector_dot @ own + jnp.where(degenerate, 0.0, vectors.T @ gradient_dot)
+    return (kept, along, degenerate), (vectors @ kept_dot @ vectors.T, vectors @ along_dot, None)
+
+
+def _decomposed(information: Array, gradient: Array, degeneracy_ratio: Array) -> tuple[tuple, Array, Array]:
+    values, vectors = jnp.linalg.eigh(information)
+    degenerate = values <= jnp.maximum(degeneracy_ratio * values[-1], jnp.finfo(values.dtype).tiny)
+    kept = (vectors * jnp.where(degenerate, 0.0, values)) @ vectors.T
+    along = vectors @ jnp.where(degenerate, 0.0, vectors.T @ gradient)
+    return (kept, along, degenerate), values, vectors
 
 
 def measured_pose(nav: NavState, T_world_lidar: jaxlie.SE3, information: Float[Array, "6 6"]) -> Measurement:
@@ -79,6 +116,5 @@ def measured_pose(nav: NavState, T_world_lidar: jaxlie.SE3, information: Float[A
     return Measurement(
         information=H.T @ information @ H,
         gradient=H.T @ information @ residual,
-        jacobian=lidar_pose_jacobian(nav),
         lost=jnp.array(False),
     )

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float, Float32
+from jaxtyping import Array, Float
 
 from lio_jax.imu.rotation_integrals import SERIES_LIMIT, rotation_series
 
@@ -72,9 +72,9 @@ def relative_path(path: Path, T_world_ref: jaxlie.SE3) -> Path:
 
 
 def deskew_along(
-    path: Path, T_imu_lidar: jaxlie.SE3, points: Float32[Array, "n 3"], time: Float32[Array, " n"]
-) -> Float32[Array, "n 3"]:
-    """Express points in the lidar frame of the path's last knot, in float32.
+    path: Path, T_imu_lidar: jaxlie.SE3, points: Float[Array, "n 3"], time: Float[Array, " n"]
+) -> Float[Array, "n 3"]:
+    """Express points in the lidar frame of the path's last knot, in the points' dtype.
 
     Args:
         path: reaches from before the first point to the scan's end.
@@ -84,8 +84,8 @@ def deskew_along(
     """
     last = jaxlie.SE3(path.T_world_imu.wxyz_xyz[-1])
     # the last lidar frame in place of the world: the arithmetic in float32 stays near the origin
-    near = jax.tree.map(lambda x: x.astype(jnp.float32), relative_path(path, last @ T_imu_lidar))
-    extrinsic = T_imu_lidar.as_matrix().astype(jnp.float32)
+    near = jax.tree.map(lambda x: x.astype(points.dtype), relative_path(path, last @ T_imu_lidar))
+    extrinsic = T_imu_lidar.as_matrix().astype(points.dtype)
     return carry(near, time, points @ extrinsic[:3, :3].T + extrinsic[:3, 3])
 
 

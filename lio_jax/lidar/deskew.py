@@ -1,23 +1,23 @@
 """Motion compensation: express every point in the sensor frame of one instant."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Float32
+from jaxtyping import Array, Float
 
 
 def deskew_constant_velocity(
-    points: Float32[Array, "n 3"], delay: Float32[Array, " n"], twist: Float[Array, "6"]
-) -> Float32[Array, "n 3"]:
+    points: Float[Array, "n 3"], delay: Float[Array, " n"], twist: Float[Array, "6"]
+) -> Float[Array, "n 3"]:
     """Move points measured ``delay`` seconds after an instant into the sensor frame of that instant.
 
-    p' = exp(delay * twist) p, the SE(3) exponential in closed form (Rodrigues), in float32 and without a
-    quaternion per point.
+    p' = exp(delay * twist) p, the SE(3) exponential in closed form (Rodrigues), in the points' dtype, without
+    a quaternion per point.
 
     Args:
         points: m, sensor frame at each point's own firing time.
         delay: firing time minus the instant, s; negative before it.
         twist: velocity of the sensor in its own frame, translation (m/s) first, then rotation (rad/s).
     """
-    velocity, rate = twist[:3].astype(jnp.float32), twist[3:].astype(jnp.float32)
+    velocity, rate = twist[:3].astype(points.dtype), twist[3:].astype(points.dtype)
     angle_squared = delay**2 * jnp.sum(rate**2)
     small = angle_squared < 1e-2  # above it 1 - cos keeps enough digits in float32
     safe = jnp.where(small, 1.0, angle_squared)

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float32, Int32
+from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.params import Params
 from lio_jax.core.types import Scan
@@ -12,9 +12,9 @@ from lio_jax.lidar.downsample import Selection, select_per_voxel
 class ThinnedScan(eqx.Module):
     """A scan's points for the map, and which of them are matched against it."""
 
-    points: Float32[Array, "m 3"]
+    points: Float[Array, "m 3"]
     """m, lidar frame at each point's own firing time."""
-    time: Float32[Array, " m"]
+    time: Float[Array, " m"]
     """Firing time from the scan's start, s."""
     mask: Bool[Array, " m"]
     matched: Selection

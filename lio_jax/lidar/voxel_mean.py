@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float32, Int32
+from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.hashing import voxel_hash
 from lio_jax.core.materialise import materialised
@@ -11,7 +11,7 @@ from lio_jax.core.materialise import materialised
 class MeanPoints(eqx.Module):
     """One point per occupied voxel, the real ones first."""
 
-    points: Float32[Array, "k 3"]
+    points: Float[Array, "k 3"]
     """m."""
     mask: Bool[Array, " k"]
     dropped: Int32[Array, ""]
@@ -19,7 +19,7 @@ class MeanPoints(eqx.Module):
 
 
 def mean_per_voxel(
-    points: Float32[Array, "n 3"], mask: Bool[Array, " n"], voxel_size: Float32[Array, ""], capacity: int
+    points: Float[Array, "n 3"], mask: Bool[Array, " n"], voxel_size: Float32[Array, ""], capacity: int
 ) -> MeanPoints:
     """Return the mean of each cubic voxel's points, of at most ``capacity`` voxels.
 
@@ -41,9 +41,9 @@ def mean_per_voxel(
     row, winner = (table.at[slot].get(mode="clip") for table in (rank, last))
     x, y, z = (voxel[:, axis] == voxel[jnp.maximum(winner, 0), axis] for axis in range(3))
     row = materialised(jnp.where(mask & x & y & z & (row < capacity), row, capacity))
-    count = jnp.zeros(capacity, jnp.float32).at[row].add(1.0, mode="drop")
-    mean = jnp.zeros((capacity, 3), jnp.float32)
+    count = jnp.zeros(capacity, points.dtype).at[row].add(1.0, mode="drop")
+    mean = jnp.zeros((capacity, 3), points.dtype)
     for axis in range(3):
-        total = jnp.zeros(capacity, jnp.float32).at[row].add(points[:, axis], mode="drop")
+        total = jnp.zeros(capacity, points.dtype).at[row].add(points[:, axis], mode="drop")
         mean = mean.at[:, axis].set(total / jnp.maximum(count, 1.0))
     return MeanPoints(mean, count > 0, jnp.maximum(rank[-1] + 1 - capacity, 0))

@@ -9,7 +9,7 @@ import itertools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float32, Int32
+from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.materialise import materialised
 from lio_jax.mapping.hash_slots import find_slots
@@ -35,7 +35,7 @@ class Neighbours(eqx.Module):
 
 def nearest_points(
     pmap: PointMap,
-    points: Float32[Array, "k 3"],
+    points: Float[Array, "k 3"],
     mask: Bool[Array, " k"],
     anchor: Int32[Array, "3"],
     voxel_size: Float32[Array, ""],
@@ -57,7 +57,7 @@ def nearest_points(
     """
     count = points.shape[0]
     edge = EDGE * voxel_size
-    points = jnp.where(mask[:, None], points, 0.0)
+    points = jnp.where(mask[:, None], points.astype(jnp.float32), 0.0)
     search = _Search(pmap, points, anchor, edge, neighbours)
     order = jnp.arange(count, dtype=jnp.int32)
     found = Neighbours(*[jnp.full((neighbours, count), jnp.inf, jnp.float32)] * 4)

@@ -9,7 +9,7 @@ vehicle is near its origin.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float32, Int32
+from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.materialise import materialised
 from lio_jax.mapping.hash_slots import FREE, claim_slots, free_keys
@@ -81,7 +81,7 @@ def move_cube(
 
 def insert(
     pmap: PointMap,
-    points: Float32[Array, "m 3"],
+    points: Float[Array, "m 3"],
     mask: Bool[Array, " m"],
     anchor: Int32[Array, "3"],
     voxel_size: Float32[Array, ""],
@@ -100,6 +100,7 @@ def insert(
         nearer_by: a point held is replaced by one that is nearer by more than this, m.
     """
     capacity = pmap.block.shape[0]
+    points = points.astype(jnp.float32)
     cell = jnp.floor(jnp.where(mask[:, None], points, 0.0) / voxel_size)
     local = jnp.floor(cell / EDGE)
     block = local.astype(jnp.int32) + anchor

@@ -57,6 +57,8 @@ class Planes(eqx.Module):
     """Direction of the smallest variance, of unit length."""
     variances: Float32[Array, "k 2"]
     """The two smaller variances, ascending, m^2."""
+    count: Float32[Array, " k"]
+    """Points of the distribution."""
     valid: Bool[Array, " k"]
     """False where no voxel around the query holds enough points."""
 
@@ -80,7 +82,7 @@ def anchor_of(position: Float[Array, "3"], voxel_size: Float[Array, ""]) -> tupl
 
 def query_nearest(
     vmap: VoxelMap,
-    points: Float32[Array, "k 3"],
+    points: Float[Array, "k 3"],
     anchor: Int32[Array, "3"],
     voxel_size: Float32[Array, ""],
     min_points: Float32[Array, ""],
@@ -96,6 +98,7 @@ def query_nearest(
         voxel_size: edge length, m.
         min_points: points a voxel needs to count.
     """
+    points = points.astype(jnp.float32)
     scaled = points / voxel_size
     own = jnp.floor(scaled)
     side = jnp.where(scaled - own > 0.5, 1, -1).astype(jnp.int32)
@@ -118,13 +121,14 @@ def query_nearest(
         mean=_mean(vmap, found, _take(vmap.voxel, found) - anchor, voxel_size),
         normal=plane[:, :3],
         variances=plane[:, 3:],
+        count=_take(vmap.centroid, (found, 3)),
         valid=nearest >= 0,
     )
 
 
 def insert(
     vmap: VoxelMap,
-    points: Float32[Array, "m 3"],
+    points: Float[Array, "m 3"],
     mask: Bool[Array, " m"],
     anchor: Int32[Array, "3"],
     voxel_size: Float32[Array, ""],
@@ -145,6 +149,7 @@ def insert(
         reach: distance from the anchor beyond which voxels may be overwritten, m.
     """
     count = points.shape[0]
+    points = points.astype(jnp.float32)
     grid = _Grid(anchor, voxel_size, reach)
     voxel, cell, _ = grid.places(points)
     slot = materialised(find_slots(vmap, voxel))

@@ -10,7 +10,7 @@ Xu, Cai, He, Lin & Zhang, "FAST-LIO2: Fast direct LiDAR-inertial odometry", T-RO
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Float32, Int32
+from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.config import Config
 from lio_jax.core.error_state import Uncertain
@@ -18,7 +18,7 @@ from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
 from lio_jax.estimation.nav_update import update_nav
-from lio_jax.estimation.pose_measurement import keep_observed, lidar_pose_jacobian
+from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.imu.path import deskew_along
 from lio_jax.lidar.voxel_mean import mean_per_voxel
 from lio_jax.mapping.point_map import EDGE, PointMap, empty_map, insert, move_cube
@@ -32,6 +32,7 @@ from lio_jax.recipes.constant_velocity import (
 )
 from lio_jax.recipes.inertial_filter import (
     Linearised,
+    evidence_of,
     levelled_start,
     lidar_pose,
     predicted,
@@ -125,12 +126,14 @@ def step(
             rotation_tolerance=params.registration.rotation_tolerance,
             translation_tolerance=params.registration.translation_tolerance,
             first_aux=scan_match.before(prior.nav),
+            again=scan_match.again,
         )
         posterior: Uncertain = update.state
         lost = (update.status > ITERATION_LIMIT) & ~first
         T_world_lidar = lidar_pose(posterior.nav)
     with jax.named_scope("insert"):
-        _, placed = frame.place(thin.points, T_world_lidar)
+        # the map is a constant of the derivative
+        _, placed = jax.lax.stop_gradient(frame.place(thin.points, T_world_lidar))
         side = params.point_map.cube_side_length
         margin = params.point_map.cube_margin * params.lidar.max_range
         in_blocks = jnp.stack([side / 2, margin]).astype(jnp.float32) / (EDGE * voxel_size)
@@ -168,12 +171,13 @@ def step(
         thinned_away=thin.dropped,
         map_dropped=added.dropped,
         covariance=posterior.covariance,
+        evidence=evidence_of(update, prior),
     )
 
 
 def _filtered(
     every: int, params: Params, scan: Scan
-) -> tuple[Float32[Array, "n 3"], Float32[Array, " n"], Bool[Array, " n"]]:
+) -> tuple[Float[Array, "n 3"], Float[Array, " n"], Bool[Array, " n"]]:
     """Return every n-th point, its time, and whether it lies between the blind radius and the far limit."""
     points, time = scan.points[::every], scan.time[::every]
     squared_range = jnp.sum(points**2, -1)
@@ -193,7 +197,7 @@ class _ScanMatch(eqx.Module):
     """The scan against the map, as a measurement of the navigation state."""
 
     map: PointMap
-    points: Float32[Array, "k 3"]
+    points: Float[Array, "k 3"]
     mask: Bool[Array, " k"]
     frame: Frame
     params: Params
@@ -206,7 +210,6 @@ class _ScanMatch(eqx.Module):
 
     def measure(self, nav: NavState, last: _Trial) -> Measurement:
         """Find each point's plane, anew where the last step was large, and linearise at ``nav``."""
-        settings = self.params.registration
         T = lidar_pose(nav)
         association = associated(
             last.association,
@@ -214,16 +217,23 @@ class _ScanMatch(eqx.Module):
             self.points,
             self.mask,
             T,
-            settings.reassociation_distance,
+            self.params.registration.reassociation_distance,
         )
-        equations = linearise(association.found, self.points, T, self.frame, self.params)
+        return self._linearised(nav, association)
+
+    def again(self, nav: NavState, last: _Trial) -> Measurement:
+        """Linearise at ``nav`` with the planes of the last linearisation."""
+        return self._linearised(nav, last.association)
+
+    def _linearised(self, nav: NavState, association: Association[Planes]) -> Measurement:
+        settings = self.params.registration
+        equations = linearise(association.found, self.points, lidar_pose(nav), self.frame, self.params)
         information, gradient, degenerate = keep_observed(
             equations.hessian, equations.gradient, equations.arm_squared, settings.degeneracy_ratio
         )
         return Measurement(
             information=settings.information_scale * information,
             gradient=settings.information_scale * gradient,
-            jacobian=lidar_pose_jacobian(nav),
             lost=equations.matches < settings.min_matches,
             aux=_Trial(association, Linearised(equations, degenerate)),
         )

@@ -21,10 +21,13 @@ from lio_jax.core.error_state import (
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import Update
+from lio_jax.estimation.pose_measurement import lidar_pose_jacobian
 from lio_jax.imu.initialise import initialise_at_rest
 from lio_jax.imu.path import Path
 from lio_jax.imu.rotation_integrals import skew
 from lio_jax.imu.strapdown import propagate
+from lio_jax.recipes.output import Evidence
+from lio_jax.registration.point_evidence import PointEvidence
 from lio_jax.registration.scan_to_map import NormalEquations, Registration
 
 
@@ -92,11 +95,7 @@ class Linearised(eqx.Module):
     @staticmethod
     def nothing(dtype: jnp.dtype) -> "Linearised":
         """Return a linearisation without matches."""
-        zero = jnp.zeros((), dtype)
-        equations = NormalEquations(
-            jnp.zeros((6, 6), dtype), jnp.zeros(6, dtype), jnp.int32(0), zero, zero, zero
-        )
-        return Linearised(equations, jnp.zeros(6, jnp.bool_))
+        return Linearised(NormalEquations.nothing(dtype), jnp.zeros(6, jnp.bool_))
 
 
 def registration_of(update: Update, last: Linearised, T_world_lidar: jaxlie.SE3) -> Registration:
@@ -108,9 +107,20 @@ def registration_of(update: Update, last: Linearised, T_world_lidar: jaxlie.SE3)
         information=to_body.T @ update.measurement.information @ to_body,
         degenerate=last.degenerate,
         matches=equations.matches,
-        rmse=jnp.sqrt(
-            equations.squared_error / jnp.maximum(equations.weight, jnp.finfo(equations.weight.dtype).tiny)
-        ),
+        rmse=equations.rmse(),
         iterations=update.iterations,
         status=update.status,
+    )
+
+
+def evidence_of(update: Update, prior: Uncertain, points: PointEvidence | None = None) -> Evidence:
+    """Return how well a scan was foretold."""
+    jacobian = lidar_pose_jacobian(prior.nav)
+    measured = update.measurement
+    return Evidence(
+        innovation=update.innovation,
+        information=measured.information,
+        gradient=measured.gradient,
+        pose_covariance=jacobian @ prior.covariance @ jacobian.T,
+        points=points,
     )

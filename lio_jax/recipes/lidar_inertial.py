@@ -8,20 +8,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float, Float32, Int32
+from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.config import Config
 from lio_jax.core.error_state import Uncertain
+from lio_jax.core.implicit import known
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
 from lio_jax.estimation.nav_update import update_nav
-from lio_jax.estimation.pose_measurement import keep_observed, lidar_pose_jacobian
-from lio_jax.imu.path import deskew_along
-from lio_jax.lidar.thinning import thinned
+from lio_jax.estimation.pose_measurement import keep_observed
+from lio_jax.imu.path import Path, deskew_along
+from lio_jax.lidar.thinning import ThinnedScan, thinned
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
 from lio_jax.recipes.inertial_filter import (
     Linearised,
+    evidence_of,
     levelled_start,
     lidar_pose,
     predicted,
@@ -29,6 +31,7 @@ from lio_jax.recipes.inertial_filter import (
 )
 from lio_jax.recipes.output import Output
 from lio_jax.registration.association import Association, associated, no_association
+from lio_jax.registration.point_evidence import point_evidence
 from lio_jax.registration.scan_to_map import Frame, Matches, associate, linearise, no_matches
 
 
@@ -83,11 +86,10 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
         prior, path = predicted(params, state.uncertain, scan, imu, first)
         T_predicted = lidar_pose(prior.nav)
         points = deskew_along(path, prior.nav.T_imu_lidar, thin.points, thin.time)
+        to_match = _to_match(path, prior.nav.T_imu_lidar, thin, points)
     with jax.named_scope("update"):
         frame = Frame(*anchor_of(T_predicted.translation(), params.map.voxel_size))
-        scan_match = _ScanMatch(
-            state.map, points[thin.matched.index], thin.matched.mask, frame, state.prediction_error, params
-        )
+        scan_match = _ScanMatch(state.map, to_match, thin.matched.mask, frame, state.prediction_error, params)
         update = update_nav(
             prior,
             scan_match.measure,
@@ -95,14 +97,18 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
             rotation_tolerance=params.registration.rotation_tolerance,
             translation_tolerance=params.registration.translation_tolerance,
             first_aux=scan_match.before(T_predicted),
+            again=scan_match.again,
         )
         posterior: Uncertain = update.state
         lost = (update.status > ITERATION_LIMIT) & ~first
         T_world_lidar = lidar_pose(posterior.nav)
+        matches = update.measurement.aux.association.found
+        evidence = point_evidence(matches, to_match, T_world_lidar, frame, params)
         missed = jnp.linalg.norm((T_predicted.inverse() @ T_world_lidar).translation())
         error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
     with jax.named_scope("insert"):
-        _, placed = frame.place(points, T_world_lidar)
+        # the map is a constant of the derivative
+        _, placed = jax.lax.stop_gradient(frame.place(points, T_world_lidar))
         vmap, added = insert(
             state.map,
             placed,
@@ -114,7 +120,8 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
 
     new_state = State(
         uncertain=posterior,
-        prediction_error=jnp.where(first | lost, state.prediction_error, error),
+        # it only opens the kernel, which is closed at the solution
+        prediction_error=jax.lax.stop_gradient(jnp.where(first | lost, state.prediction_error, error)),
         scans=state.scans + jnp.any(thin.mask).astype(jnp.int32),
         map=vmap,
     )
@@ -130,6 +137,7 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
         thinned_away=thin.dropped,
         map_dropped=added.dropped,
         covariance=posterior.covariance,
+        evidence=evidence_of(update, prior, evidence),
     )
 
 
@@ -141,11 +149,19 @@ class _Trial(eqx.Module):
     linearised: Linearised
 
 
+def _to_match(
+    path: Path, T_imu_lidar: jaxlie.SE3, thin: ThinnedScan, deskewed: Float[Array, "m 3"]
+) -> Float[Array, "k 3"]:
+    """Return the compensated points to match: only these few need a derivative."""
+    index = thin.matched.index
+    return known(deskewed[index], deskew_along, path, T_imu_lidar, thin.points[index], thin.time[index])
+
+
 class _ScanMatch(eqx.Module):
     """The scan against the map, as a measurement of the navigation state."""
 
     map: VoxelMap
-    points: Float32[Array, "k 3"]
+    points: Float[Array, "k 3"]
     mask: Bool[Array, " k"]
     frame: Frame
     prediction_error: Float[Array, ""]
@@ -158,19 +174,33 @@ class _ScanMatch(eqx.Module):
 
     def measure(self, nav: NavState, last: _Trial) -> Measurement:
         """Match and linearise at ``nav``; the kernel opens and narrows as in :func:`register`."""
-        settings = self.params.registration
         T = lidar_pose(nav)
-        opening = self.prediction_error * 0.5 ** last.iteration.astype(self.prediction_error.dtype)
         association = associated(
             last.association,
             lambda: associate(self.map, self.points, self.mask, T, self.frame, self.params),
             self.points,
             self.mask,
             T,
-            settings.reassociation_distance,
+            self.params.registration.reassociation_distance,
         )
+        return self._linearised(nav, association, last.iteration)
+
+    def again(self, nav: NavState, last: _Trial) -> Measurement:
+        """Linearise at ``nav`` with the matches and the kernel of the last linearisation."""
+        return self._linearised(nav, last.association, last.iteration - 1)
+
+    def _linearised(
+        self, nav: NavState, association: Association[Matches], iteration: Int32[Array, ""]
+    ) -> Measurement:
+        settings = self.params.registration
+        opening = self.prediction_error * 0.5 ** iteration.astype(self.prediction_error.dtype)
         equations = linearise(
-            association.found, self.points, T, self.frame, settings.kernel + opening, self.params
+            association.found,
+            self.points,
+            lidar_pose(nav),
+            self.frame,
+            settings.kernel + opening,
+            self.params,
         )
         information, gradient, degenerate = keep_observed(
             equations.hessian, equations.gradient, equations.arm_squared, settings.degeneracy_ratio
@@ -178,8 +208,7 @@ class _ScanMatch(eqx.Module):
         return Measurement(
             information=settings.information_scale * information,
             gradient=settings.information_scale * gradient,
-            jacobian=lidar_pose_jacobian(nav),
             lost=equations.matches < settings.min_matches,
-            aux=_Trial(association, last.iteration + 1, Linearised(equations, degenerate)),
+            aux=_Trial(association, iteration + 1, Linearised(equations, degenerate)),
             settled=opening < settings.kernel,
         )

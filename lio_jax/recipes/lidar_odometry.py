@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float, Int32
+from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.config import Config
 from lio_jax.core.params import Params
@@ -16,7 +16,7 @@ from lio_jax.lidar.deskew import deskew_constant_velocity
 from lio_jax.lidar.thinning import thinned
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
 from lio_jax.recipes.output import Output
-from lio_jax.registration.scan_to_map import TOO_FEW_MATCHES, register
+from lio_jax.registration.scan_to_map import TOO_FEW_MATCHES, Frame, register
 
 
 class State(eqx.Module):
@@ -89,17 +89,12 @@ def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[Stat
         interval = jnp.where(first, 0.0, scan.interval.astype(state.twist.dtype))
         elapsed = state.mid_to_end + interval - middle
         prediction = state.T_world_lidar @ jaxlie.SE3.exp(elapsed * state.twist)
-        T_last_inverse = state.T_world_lidar.inverse()
-
-        def twist_to(T_world_lidar: jaxlie.SE3) -> Array:
-            moved = (T_last_inverse @ T_world_lidar).log()
-            known = ~first & (elapsed > 0)
-            return jnp.where(known, moved / jnp.where(known, elapsed, 1.0), state.twist)
+        motion = _Motion(state.T_world_lidar, state.twist, elapsed, ~first & (elapsed > 0))
 
     with jax.named_scope("register"):
         result = register(
             state.map,
-            lambda T: deskew_constant_velocity(thin.points[matched.index], delay[matched.index], twist_to(T)),
+            _Deskewed(thin.points[matched.index], delay[matched.index], motion),
             matched.mask,
             prediction,
             state.prediction_error,
@@ -107,16 +102,16 @@ def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[Stat
             config.registration.max_iterations,
         )
         lost = (result.status == TOO_FEW_MATCHES) & ~first
-        twist = jnp.where(lost, state.twist, twist_to(result.T_world_lidar))
+        twist = jnp.where(lost, state.twist, motion.twist_to(result.T_world_lidar))
         missed = jnp.linalg.norm((prediction.inverse() @ result.T_world_lidar).translation())
         error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
-        error = jnp.where(first | lost, state.prediction_error, error)
+        # it only opens the kernel, which is closed at the solution
+        error = jax.lax.stop_gradient(jnp.where(first | lost, state.prediction_error, error))
     with jax.named_scope("insert"):
         T = result.T_world_lidar
         anchor, corner = anchor_of(T.translation(), params.map.voxel_size)
-        shift = (T.translation() - corner).astype(jnp.float32)
         deskewed = deskew_constant_velocity(thin.points, delay, twist)
-        anchored = deskewed @ T.rotation().as_matrix().astype(jnp.float32).T + shift
+        _, anchored = jax.lax.stop_gradient(Frame(anchor, corner).place(deskewed, T))
         vmap, added = insert(
             state.map,
             anchored,
@@ -154,6 +149,32 @@ def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[Stat
         thinned_away=thin.dropped,
         map_dropped=added.dropped,
     )
+
+
+class _Motion(eqx.Module):
+    """The motion since the last scan, as long as its end is under trial."""
+
+    T_last: jaxlie.SE3
+    last_twist: Float[Array, "6"]
+    elapsed: Float[Array, ""]
+    known: Bool[Array, ""]
+
+    def twist_to(self, T_world_lidar: jaxlie.SE3) -> Float[Array, "6"]:
+        """Return the constant twist that leads to a pose; the last one where there was no scan before."""
+        moved = (self.T_last.inverse() @ T_world_lidar).log()
+        return jnp.where(self.known, moved / jnp.where(self.known, self.elapsed, 1.0), self.last_twist)
+
+
+class _Deskewed(eqx.Module):
+    """The points to match, compensated by the motion that a trial pose implies."""
+
+    points: Float[Array, "k 3"]
+    delay: Float[Array, " k"]
+    motion: _Motion
+
+    def __call__(self, T_world_lidar: jaxlie.SE3) -> Float[Array, "k 3"]:
+        """Return the points in the lidar frame of the scan's middle."""
+        return deskew_constant_velocity(self.points, self.delay, self.motion.twist_to(T_world_lidar))
 
 
 def _imu_velocity(T_world_imu: jaxlie.SE3, twist: Float[Array, "6"], params: Params) -> Float[Array, "3"]:

@@ -1,9 +1,26 @@
 """What every recipe's step reports beside its state."""
 
 import equinox as eqx
-from jaxtyping import Array, Bool, Float, Float32, Int32
+from jaxtyping import Array, Bool, Float, Int32
 
+from lio_jax.estimation.innovation import Innovation
+from lio_jax.registration.point_evidence import PointEvidence
 from lio_jax.registration.scan_to_map import Registration
+
+
+class Evidence(eqx.Module):
+    """How well a scan was foretold by the prediction and the map."""
+
+    innovation: Innovation
+    """Of the scan match as one measurement of the pose."""
+    information: Float[Array, "6 6"]
+    """Of that measurement: the share of the points' information that the filter believed."""
+    gradient: Float[Array, "6"]
+    """Of the measurement's half squared error at the solution."""
+    pose_covariance: Float[Array, "6 6"]
+    """Of the predicted lidar pose, in the same perturbation."""
+    points: PointEvidence | None = None
+    """None from recipes whose map keeps no distributions."""
 
 
 class Output(eqx.Module):
@@ -16,7 +33,7 @@ class Output(eqx.Module):
     """Normalised innovation squared of the match against the prediction; 0 where there was none."""
     nis_dof: Int32[Array, ""]
     """Its degrees of freedom: the directions the match observed."""
-    points: Float32[Array, "m 3"]
+    points: Float[Array, "m 3"]
     """The thinned scan, motion compensated, in world axes from ``origin``, m."""
     points_mask: Bool[Array, " m"]
     added: Bool[Array, " m"]
@@ -29,3 +46,5 @@ class Output(eqx.Module):
     """Points whose voxel found no room in the map."""
     covariance: Float[Array, "24 24"] | None = None
     """Of the navigation state's error; None from recipes that carry none."""
+    evidence: Evidence | None = None
+    """None from recipes that carry no covariance."""

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float, Float32
+from jaxtyping import Array, Bool, Float
 
 _Found = TypeVar("_Found")
 """What the points were associated with, as a pytree of arrays."""
@@ -33,7 +33,7 @@ def no_association(nothing: _Found, T_world_lidar: jaxlie.SE3) -> Association[_F
 def associated(
     last: Association[_Found],
     find: Callable[[], _Found],
-    points: Float32[Array, "k 3"],
+    points: Float[Array, "k 3"],
     mask: Bool[Array, " k"],
     T_world_lidar: jaxlie.SE3,
     distance: Float[Array, ""],

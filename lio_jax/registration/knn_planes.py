@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float32
+from jaxtyping import Array, Bool, Float, Float32
 
 from lio_jax.core.geometry import eigenvalues_and_normal3
 from lio_jax.core.materialise import materialised
@@ -33,7 +33,7 @@ def no_planes(mask: Bool[Array, " k"]) -> Planes:
 
 def associate(
     pmap: PointMap,
-    points: Float32[Array, "k 3"],
+    points: Float[Array, "k 3"],
     mask: Bool[Array, " k"],
     T_world_lidar: jaxlie.SE3,
     frame: Frame,
@@ -84,7 +84,7 @@ def fit_planes(x: _Coordinates, y: _Coordinates, z: _Coordinates) -> tuple[Plane
 
 def linearise(
     planes: Planes,
-    points: Float32[Array, "k 3"],
+    points: Float[Array, "k 3"],
     T_world_lidar: jaxlie.SE3,
     frame: Frame,
     params: Params,
@@ -94,7 +94,7 @@ def linearise(
     A point at range r and distance d from its plane counts if 1 - w |d| / sqrt(r) exceeds a threshold
     (``params.knn.distance_weight`` w and ``params.knn.min_score``); all that count, count alike.
     """
-    dtype = T_world_lidar.wxyz_xyz.dtype
+    dtype, kind = T_world_lidar.wxyz_xyz.dtype, points.dtype
     knn = params.knn
     arm, placed = frame.place(jnp.where(planes.valid[:, None], points, 0.0), T_world_lidar)
     (px, py, pz), (rx, ry, rz), (nx, ny, nz) = materialised(
@@ -102,10 +102,10 @@ def linearise(
     )
     distance = nx * px + ny * py + nz * pz + planes.offset
     range_squared = rx**2 + ry**2 + rz**2
-    weight = knn.distance_weight.astype(jnp.float32)
+    weight = knn.distance_weight.astype(kind)
     score = 1 - weight * jnp.abs(distance) / jnp.maximum(range_squared, 1e-6) ** 0.25
-    used = planes.valid & (score > knn.min_score.astype(jnp.float32))
-    counts = used.astype(jnp.float32)
+    used = planes.valid & (score > knn.min_score.astype(kind))
+    counts = used.astype(kind)
     distance = jnp.where(used, distance, 0.0)
     # one matrix product gives every sum over the points
     columns = (ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx, nx, ny, nz, distance)

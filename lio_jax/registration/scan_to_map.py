@@ -1,6 +1,7 @@
 """Register a scan against the voxel map: point-to-plane, robust Gauss-Newton, degeneracy aware."""
 
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -8,9 +9,10 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
+from lio_jax.core.implicit import Problem, Solution, implicit
 from lio_jax.core.params import Params
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, query_nearest
-from lio_jax.registration.association import associated, no_association
+from lio_jax.registration.association import Association, associated, no_association
 
 CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES = 0, 1, 2
 """Status codes of a solve."""
@@ -46,6 +48,18 @@ class NormalEquations(eqx.Module):
     arm_squared: Float[Array, ""]
     """Mean squared distance of the points from the sensor, m^2: scales rotations to metres."""
 
+    @staticmethod
+    def nothing(dtype: jnp.dtype) -> "NormalEquations":
+        """Return the equations of no points."""
+        zero = jnp.zeros((), dtype)
+        return NormalEquations(jnp.zeros((6, 6), dtype), jnp.zeros(6, dtype), jnp.int32(0), zero, zero, zero)
+
+    def rmse(self) -> Float[Array, ""]:
+        """Return the robustly weighted root mean square distance to the map, m; 0 without matches."""
+        some = (self.weight > 0) & (self.squared_error > 0)
+        mean = jnp.where(some, self.squared_error, 1.0) / jnp.where(some, self.weight, 1.0)
+        return jnp.where(some, jnp.sqrt(mean), 0.0)
+
 
 class Frame(eqx.Module):
     """World axes from a corner of the map's grid near the sensor: where float32 is precise."""
@@ -56,11 +70,11 @@ class Frame(eqx.Module):
     """That corner, m in world."""
 
     def place(
-        self, points: Float32[Array, "k 3"], T_world_lidar: jaxlie.SE3
-    ) -> tuple[Float32[Array, "k 3"], Float32[Array, "k 3"]]:
+        self, points: Float[Array, "k 3"], T_world_lidar: jaxlie.SE3
+    ) -> tuple[Float[Array, "k 3"], Float[Array, "k 3"]]:
         """Return points of the lidar frame in world axes, from the sensor and from the origin, m."""
-        arm = points @ T_world_lidar.rotation().as_matrix().astype(jnp.float32).T
-        return arm, arm + (T_world_lidar.translation() - self.origin).astype(jnp.float32)
+        arm = points @ T_world_lidar.rotation().as_matrix().astype(points.dtype).T
+        return arm, arm + (T_world_lidar.translation() - self.origin).astype(points.dtype)
 
 
 class Matches(eqx.Module):
@@ -69,20 +83,67 @@ class Matches(eqx.Module):
     mean: Float32[Array, "k 3"]
     """m."""
     normal: Float32[Array, "k 3"]
-    precision: Float32[Array, " k"]
-    """Of the distance along the normal, 1/m^2; zero where there is no match."""
+    variances: Float32[Array, "k 2"]
+    """The voxel's two smaller variances, ascending, m^2."""
+    count: Float32[Array, " k"]
+    """Points of the voxel."""
     used: Bool[Array, " k"]
 
 
 def associate(
     vmap: VoxelMap,
-    points: Float32[Array, "k 3"],
+    points: Float[Array, "k 3"],
     mask: Bool[Array, " k"],
     T_world_lidar: jaxlie.SE3,
     frame: Frame,
     params: Params,
 ) -> Matches:
-    """Return the plane of the map that each point lies on at a pose.
+    """Return the distribution of the map that each point lies on at a pose."""
+    _, placed = frame.place(jnp.where(mask[:, None], points, 0.0), T_world_lidar)
+    near = query_nearest(
+        vmap,
+        placed,
+        frame.anchor,
+        params.map.voxel_size.astype(jnp.float32),
+        params.map.min_points.astype(jnp.float32),
+    )
+    return Matches(near.mean, near.normal, near.variances, near.count, mask & near.valid)
+
+
+def no_matches(mask: Bool[Array, " k"]) -> Matches:
+    """Return matches of none of the points."""
+    zeros = jnp.zeros((*mask.shape, 3), jnp.float32)
+    return Matches(zeros, zeros, zeros[:, :2], zeros[:, 0], jnp.zeros_like(mask))
+
+
+class PointNoise(eqx.Module):
+    """Each matched point's distance from its plane and the noise of that distance."""
+
+    arm: Float[Array, "k 3"]
+    """From the sensor, in world axes, m."""
+    distance: Float[Array, " k"]
+    """Along the plane's normal, m; zero where there is no match."""
+    facing: Float[Array, " k"]
+    """Cosine of incidence."""
+    variance: Float[Array, " k"]
+    """Of the distance, m^2; one where there is no match."""
+    precision: Float[Array, " k"]
+    """What the distance is believed with, 1/m^2; zero where there is no match."""
+
+    def weight(self, kernel: Float[Array, ""], range_sigma: Float[Array, ""]) -> Float[Array, " k"]:
+        """Return the Geman-McClure weights of the noise-scaled distances, zero where there is no match."""
+        squared = range_sigma**2 * self.precision * self.distance**2
+        return jnp.where(self.precision > 0, (kernel**2 / (kernel**2 + squared)) ** 2, 0.0)
+
+
+def point_noise(
+    matches: Matches,
+    points: Float[Array, "k 3"],
+    T_world_lidar: jaxlie.SE3,
+    frame: Frame,
+    params: Params,
+) -> PointNoise:
+    """Return the distances of associated points from their planes at a pose, and their noise.
 
     A point is measured along the normal of its voxel, with the precision
     k = 1 / (s^2 + l0) - 1 / (s^2 + l1), where l0 <= l1 are the two smaller variances of the voxel: what is
@@ -91,32 +152,28 @@ def associate(
     between. The point's own variance s^2 is that of the range, plus that of the beam's direction times the
     squared offset along the surface, which grows with range and grazing incidence.
     """
-    arm, placed = frame.place(jnp.where(mask[:, None], points, 0.0), T_world_lidar)
-    near = query_nearest(
-        vmap,
-        placed,
-        frame.anchor,
-        params.map.voxel_size.astype(jnp.float32),
-        params.map.min_points.astype(jnp.float32),
+    kind = points.dtype
+    arm, placed = frame.place(jnp.where(matches.used[:, None], points, 0.0), T_world_lidar)
+    along = jnp.sum(arm * matches.normal, -1)
+    range_squared = jnp.sum(arm**2, -1)
+    across = jnp.maximum(range_squared - along**2, 0.0)
+    own = params.lidar.range_sigma.astype(kind) ** 2 + params.lidar.angle_sigma.astype(kind) ** 2 * across
+    variances = own[:, None] + matches.variances
+    known = 1 / variances
+    distance = jnp.sum(matches.normal * (placed - matches.mean), -1)
+    far = jnp.where(matches.used, range_squared, 1.0)
+    return PointNoise(
+        arm=arm,
+        distance=jnp.where(matches.used, distance, 0.0),
+        facing=jnp.abs(along) / jnp.sqrt(far),
+        variance=jnp.where(matches.used, variances[:, 0], 1.0),
+        precision=jnp.where(matches.used, known[:, 0] - known[:, 1], 0.0),
     )
-    along = jnp.sum(arm * near.normal, -1)
-    across = jnp.sum(arm**2, -1) - along**2
-    angle_sigma = params.lidar.angle_sigma.astype(jnp.float32)
-    noise = params.lidar.range_sigma.astype(jnp.float32) ** 2 + angle_sigma**2 * jnp.maximum(across, 0.0)
-    known = 1 / (noise[:, None] + near.variances)
-    used = mask & near.valid
-    return Matches(near.mean, near.normal, jnp.where(used, known[:, 0] - known[:, 1], 0.0), used)
-
-
-def no_matches(mask: Bool[Array, " k"]) -> Matches:
-    """Return matches of none of the points."""
-    zeros = jnp.zeros((*mask.shape, 3), jnp.float32)
-    return Matches(zeros, zeros, zeros[:, 0], jnp.zeros_like(mask))
 
 
 def linearise(
     matches: Matches,
-    points: Float32[Array, "k 3"],
+    points: Float[Array, "k 3"],
     T_world_lidar: jaxlie.SE3,
     frame: Frame,
     kernel: Float[Array, ""],
@@ -127,13 +184,12 @@ def linearise(
     Robust weight: Geman-McClure on s sqrt(k) n'e, the noise-scaled distance in m of a point at offset e from
     its plane's mean, with precision k.
     """
-    dtype = T_world_lidar.wxyz_xyz.dtype
-    arm, placed = frame.place(jnp.where(matches.used[:, None], points, 0.0), T_world_lidar)
-    noise = params.lidar.range_sigma.astype(jnp.float32) ** 2
-    distance = jnp.where(matches.used, jnp.sum(matches.normal * (placed - matches.mean), -1), 0.0)
-    distance_squared = noise * matches.precision * distance**2
-    kernel_squared = kernel.astype(jnp.float32) ** 2
-    weight = jnp.where(matches.used, (kernel_squared / (kernel_squared + distance_squared)) ** 2, 0.0)
+    dtype, kind = T_world_lidar.wxyz_xyz.dtype, points.dtype
+    noise = point_noise(matches, points, T_world_lidar, frame, params)
+    range_sigma = params.lidar.range_sigma.astype(kind)
+    weight = noise.weight(kernel.astype(kind), range_sigma)
+    distance_squared = range_sigma**2 * noise.precision * noise.distance**2
+    arm, distance = noise.arm, noise.distance
 
     # one matrix product gives every sum over the points: the normal equations from the rows, the rest from
     # the column of ones
@@ -146,9 +202,9 @@ def linearise(
         ],
         -1,
     )
-    matched = matches.used.astype(jnp.float32)
+    matched = matches.used.astype(kind)
     scalars = [matched, weight, weight * distance_squared, matched * jnp.sum(arm**2, -1)]
-    weighted = jnp.concatenate([(weight * matches.precision)[:, None] * row, jnp.stack(scalars, -1)], -1)
+    weighted = jnp.concatenate([(weight * noise.precision)[:, None] * row, jnp.stack(scalars, -1)], -1)
     sums = (row.T @ weighted).astype(dtype)
     count, weight_sum, squared_error, arm_squared = sums[7, 8:]
     return NormalEquations(
@@ -163,7 +219,7 @@ def linearise(
 
 def register(
     vmap: VoxelMap,
-    points_at: Callable[[jaxlie.SE3], Float32[Array, "k 3"]],
+    points_at: Callable[[jaxlie.SE3], Float[Array, "k 3"]],
     mask: Bool[Array, " k"],
     T_world_lidar: jaxlie.SE3,
     prediction_error: Float[Array, ""],
@@ -177,76 +233,145 @@ def register(
     Zisserman 1987). Directions the scan does not constrain keep the prediction (Zhang & Singh, "On
     degeneracy of optimization-based state estimation problems", ICRA 2016).
 
+    Derivatives are those of the converged pose with map, associations, kernel and held directions fixed
+    (:mod:`lio_jax.core.implicit`); where the status is ITERATION_LIMIT they are not to be trusted.
+
     Args:
         vmap: the map.
         points_at: the motion-compensated points in the lidar frame, m, given the pose under trial: the
-            compensation may depend on it.
+            compensation may depend on it. A pytree, if what it holds is to be differentiated.
         mask: which points are real.
         T_world_lidar: predicted pose.
         prediction_error: expected error of the prediction, m.
         params: traced parameters.
         max_iterations: bound of the loop.
     """
+    task = _Task(vmap, points_at, mask, T_world_lidar, prediction_error, params)
+    problem = Problem(
+        partial(_solve, max_iterations), _again, _missed, lambda step, equations, end, task: equations
+    )
+    step, end, equations = implicit(problem, task)
+    T = _moved(end.T_world_lidar, step)
     settings = params.registration
-    dtype = T_world_lidar.wxyz_xyz.dtype
-
-    def opening(iteration: Array) -> Array:
-        return prediction_error * 0.5 ** iteration.astype(dtype)
-
-    frame = Frame(*anchor_of(T_world_lidar.translation(), params.map.voxel_size))
-
-    def iterate(carry: tuple) -> tuple:
-        T, iteration, _, association, _, _ = carry
-        points = points_at(T)
-        association = associated(
-            association,
-            lambda: associate(vmap, points, mask, T, frame, params),
-            points,
-            mask,
-            T,
-            settings.reassociation_distance,
-        )
-        kernel = settings.kernel + opening(iteration)
-        equations = linearise(association.found, points, T, frame, kernel, params)
-        step, degenerate = _solve_observable(equations, settings.degeneracy_ratio)
-        turn, move = step[:3], step[3:]
-        T = jaxlie.SE3.from_rotation_and_translation(
-            (jaxlie.SO3.exp(turn) @ T.rotation()).normalize(), T.translation() + move
-        )
-        small = (jnp.linalg.norm(turn) < settings.rotation_tolerance) & (
-            jnp.linalg.norm(move) < settings.translation_tolerance
-        )
-        done = (small & (opening(iteration) < settings.kernel)) | (equations.matches < settings.min_matches)
-        return T, iteration + 1, done, association, equations, degenerate
-
-    def unfinished(carry: tuple) -> Array:
-        return (carry[1] < max_iterations) & ~carry[2]
-
-    start = (T_world_lidar, jnp.int32(0), jnp.array(False), no_association(no_matches(mask), T_world_lidar))
-    shapes = jax.eval_shape(lambda: iterate((*start, None, None))[4:])
-    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    T, iterations, done, _, equations, degenerate = jax.lax.while_loop(unfinished, iterate, (*start, *blank))
-
     lost = (equations.matches < settings.min_matches) | ~jnp.all(jnp.isfinite(T.wxyz_xyz))
     T = jaxlie.SE3(jnp.where(lost, T_world_lidar.wxyz_xyz, T.wxyz_xyz))
     to_body = jax.scipy.linalg.block_diag(*[T.rotation().as_matrix()] * 2)
     return Registration(
         T_world_lidar=T,
         information=jnp.where(lost, 0.0, to_body.T @ equations.hessian @ to_body),
-        degenerate=degenerate,
+        degenerate=end.degenerate,
         matches=equations.matches,
-        rmse=jnp.sqrt(equations.squared_error / jnp.maximum(equations.weight, jnp.finfo(dtype).tiny)),
-        iterations=iterations,
-        status=jnp.where(lost, TOO_FEW_MATCHES, jnp.where(done, CONVERGED, ITERATION_LIMIT)).astype(
+        rmse=equations.rmse(),
+        iterations=end.iterations,
+        status=jnp.where(lost, TOO_FEW_MATCHES, jnp.where(end.done, CONVERGED, ITERATION_LIMIT)).astype(
             jnp.int32
         ),
     )
 
 
+class _Task(eqx.Module):
+    """What there is to register."""
+
+    map: VoxelMap
+    points_at: Callable[[jaxlie.SE3], Float[Array, "k 3"]]
+    mask: Bool[Array, " k"]
+    T_predicted: jaxlie.SE3
+    prediction_error: Float[Array, ""]
+    params: Params
+
+    def opening(self, iteration: Int32[Array, ""]) -> Float[Array, ""]:
+        """Return by how much the kernel is still open."""
+        return self.prediction_error * 0.5 ** iteration.astype(self.prediction_error.dtype)
+
+    def linearised(
+        self, T_world_lidar: jaxlie.SE3, points: Array, matches: Matches, iteration: Int32[Array, ""]
+    ) -> NormalEquations:
+        """Return the normal equations at a pose with the kernel of an iteration."""
+        kernel = self.params.registration.kernel + self.opening(iteration)
+        return linearise(matches, points, T_world_lidar, self.frame(), kernel, self.params)
+
+    def frame(self) -> Frame:
+        """Return axes near the sensor."""
+        return Frame(*anchor_of(self.T_predicted.translation(), self.params.map.voxel_size))
+
+
+class _End(eqx.Module):
+    """Where the iteration ended, and by what choices."""
+
+    T_world_lidar: jaxlie.SE3
+    iterations: Int32[Array, ""]
+    done: Bool[Array, ""]
+    association: Association[Matches]
+    vectors: Float[Array, "6 6"]
+    """Directions in columns, scaled to metres, in which the last step was taken ..."""
+    degenerate: Bool[Array, " 6"]
+    """... and which of them were held."""
+
+
+def _solve(max_iterations: int, task: _Task) -> Solution:
+    settings = task.params.registration
+    mask, prediction = task.mask, task.T_predicted
+
+    def iterate(carry: tuple) -> tuple:
+        end, _ = carry
+        T = end.T_world_lidar
+        points = task.points_at(T)
+        association = associated(
+            end.association,
+            lambda: associate(task.map, points, mask, T, task.frame(), task.params),
+            points,
+            mask,
+            T,
+            settings.reassociation_distance,
+        )
+        equations = task.linearised(T, points, association.found, end.iterations)
+        step, vectors, degenerate = _solve_observable(equations, settings.degeneracy_ratio)
+        small = (jnp.linalg.norm(step[:3]) < settings.rotation_tolerance) & (
+            jnp.linalg.norm(step[3:]) < settings.translation_tolerance
+        )
+        done = small & (task.opening(end.iterations) < settings.kernel)
+        done = done | (equations.matches < settings.min_matches)
+        following = _moved(T, step)
+        return _End(following, end.iterations + 1, done, association, vectors, degenerate), equations
+
+    def unfinished(carry: tuple) -> Array:
+        return (carry[0].iterations < max_iterations) & ~carry[0].done
+
+    dtype = prediction.wxyz_xyz.dtype
+    nothing = no_association(no_matches(mask), prediction)
+    start = _End(
+        prediction, jnp.int32(0), jnp.array(False), nothing, jnp.zeros((6, 6), dtype), jnp.zeros(6, bool)
+    )
+    end, equations = jax.lax.while_loop(unfinished, iterate, (start, NormalEquations.nothing(dtype)))
+    return Solution(jnp.zeros(6, dtype), end, equations)
+
+
+def _again(step: Float[Array, "6"], end: _End, task: _Task) -> NormalEquations:
+    """Linearise once more at a pose beside the solution, with the associations found."""
+    T = _moved(end.T_world_lidar, step)
+    return task.linearised(T, task.points_at(T), end.association.found, end.iterations - 1)
+
+
+def _missed(step: Float[Array, "6"], equations: NormalEquations, end: _End, task: _Task) -> Float[Array, "6"]:
+    """Return what vanishes at the solution: the gradient where observed, else the way from the prediction."""
+    T = _moved(end.T_world_lidar, step)
+    turn = (T.rotation() @ task.T_predicted.rotation().inverse()).log()
+    way = jnp.concatenate([turn, T.translation() - task.T_predicted.translation()])
+    along = jnp.linalg.solve(end.vectors, way)
+    held = along - jax.lax.stop_gradient(along)
+    return jnp.where(end.degenerate, held, end.vectors.T @ equations.gradient)
+
+
+def _moved(T_world_lidar: jaxlie.SE3, step: Float[Array, "6"]) -> jaxlie.SE3:
+    """Return a pose turned and moved in world axes at its own position."""
+    rotation = (jaxlie.SO3.exp(step[:3]) @ T_world_lidar.rotation()).normalize()
+    return jaxlie.SE3.from_rotation_and_translation(rotation, T_world_lidar.translation() + step[3:])
+
+
 def _solve_observable(
     equations: NormalEquations, degeneracy_ratio: Float[Array, ""]
-) -> tuple[Float[Array, "6"], Bool[Array, " 6"]]:
-    """Return the Gauss-Newton step in the directions that are observed, and which are not.
+) -> tuple[Float[Array, "6"], Float[Array, "6 6"], Bool[Array, " 6"]]:
+    """Return the Gauss-Newton step in the directions that are observed, the directions, and which are not.
 
     Rotations are scaled by the scan's rms lever arm so that all six directions are in metres.
     """
@@ -258,4 +383,4 @@ def _solve_observable(
     degenerate = values <= jnp.maximum(degeneracy_ratio * values[-1], jnp.finfo(dtype).tiny)
     along = -(vectors.T @ (scale * equations.gradient))
     along = jnp.where(degenerate, 0.0, along / jnp.where(degenerate, 1.0, values))
-    return scale * (vectors @ along), degenerate
+    return scale * (vectors @ along), scale[:, None] * vectors, degenerate

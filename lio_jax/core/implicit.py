@@ -1,0 +1,143 @@
+"""Derivatives of converged solves by the implicit function theorem, and of values that are already known.
+
+Nothing here differentiates an iteration. Both rules work forwards and backwards, and what a batch of tangents
+has in common is computed once.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+_Value = TypeVar("_Value")
+
+
+class Solution(NamedTuple):
+    """What a solve found."""
+
+    root: Float[Array, " d"]
+    selection: Any
+    """Choices made on the way, such as associations: constants of the derivative."""
+    reported: Any
+    """By-products at the root."""
+
+
+class Problem(eqx.Module):
+    """A solve and the equations that its result satisfies.
+
+    Its functions must not close over arrays that are differentiated: those belong into ``inputs``.
+    """
+
+    solve: Callable[[Any], Solution]
+    """``inputs ->`` the solution, by whatever iteration."""
+    probe: Callable[[Array, Any, Any], Any]
+    """``(root, selection, inputs) ->`` all that is costly in residual and report."""
+    residual: Callable[[Array, Any, Any, Any], Array]
+    """``(root, probed, selection, inputs) ->`` d values, zero at the root."""
+    report: Callable[[Array, Any, Any, Any], Any]
+    """``(root, probed, selection, inputs) ->`` what ``solve`` reports, as a function of the root."""
+    directions: Callable[[Array, Any], tuple[Array, Array]] | None = None
+    """``(root, inputs) -> B (d, k), C (k, d)``: the probe feels a step dx of the root as it would B C dx, so
+    that k of its derivatives will do. None: the identity."""
+
+
+def implicit(problem: Problem, inputs: Any) -> Solution:
+    """Return the problem's solution with the derivative of the root of ``residual = 0``.
+
+    By the implicit function theorem dx = -(dr/dx)^-1 (dr/dinputs) dinputs (Krantz & Parks, "The implicit
+    function theorem", 2002), which costs one d by d factorisation however many iterations the solve took and
+    however many tangents there are. It is the derivative of a *converged* solve: carry the solve's status
+    along and don't trust the derivative where it did not converge.
+    """
+    return _implicit(problem, inputs)
+
+
+@eqx.filter_custom_jvp
+def _implicit(problem: Problem, inputs: Any) -> Solution:
+    return problem.solve(inputs)
+
+
+@_implicit.def_jvp
+def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
+    problem, inputs = primals
+    solution = _implicit(problem, inputs)
+    root = solution.root
+    moving, fixed, inputs_dot = _split(inputs, tangents[1])
+
+    def probe(root: Array, moving: Any) -> tuple[Any, Any]:
+        probed = problem.probe(root, solution.selection, eqx.combine(moving, fixed))
+        return eqx.partition(probed, eqx.is_inexact_array)
+
+    smooth, probed_push, rest = jax.jvp(
+        lambda moving: probe(root, moving), (moving,), (inputs_dot,), has_aux=True
+    )
+    forth = back = jnp.eye(len(root), dtype=root.dtype)
+    if problem.directions is not None:
+        forth, back = problem.directions(root, inputs)
+    along = jax.vmap(lambda step: jax.jvp(lambda root: probe(root, moving)[0], (root,), (step,))[1])(forth.T)
+
+    def felt(step: Array) -> Any:
+        return jax.tree.map(lambda slope: jnp.tensordot((back @ step).astype(slope.dtype), slope, 1), along)
+
+    def known_of(smooth: Any) -> tuple[Any, Any]:
+        return eqx.combine(smooth, rest), solution.selection
+
+    def residual(root: Array, smooth: Any, moving: Any) -> Array:
+        return problem.residual(root, *known_of(smooth), eqx.combine(moving, fixed))
+
+    def report(root: Array, smooth: Any, moving: Any) -> Any:
+        return problem.report(root, *known_of(smooth), eqx.combine(moving, fixed))
+
+    def slope_along(step: Array) -> Array:
+        by_root = lambda root, smooth: residual(root, smooth, moving)  # noqa: E731
+        return jax.jvp(by_root, (root, smooth), (step, felt(step)))[1]
+
+    slope = jax.vmap(slope_along, out_axes=1)(jnp.eye(len(root), dtype=root.dtype))
+    _, push = jax.jvp(
+        lambda smooth, moving: residual(root, smooth, moving), (smooth, moving), (probed_push, inputs_dot)
+    )
+    root_dot = -jnp.linalg.solve(slope, push)
+    probed_dot = jax.tree.map(jnp.add, probed_push, felt(root_dot))
+    _, reported_dot = jax.jvp(report, (root, smooth, moving), (root_dot, probed_dot, inputs_dot))
+    return solution, Solution(root_dot, _still(solution.selection), _tangent(reported_dot))
+
+
+def known(value: _Value, function: Callable[..., _Value], *inputs: Any) -> _Value:
+    """Return ``value`` with the derivative of ``function(*inputs)``, which would compute the same.
+
+    For a result that is at hand already, as part of a larger one whose other parts need no derivative.
+    ``function`` must not close over arrays that are differentiated.
+    """
+    return _known(value, function, inputs)
+
+
+@eqx.filter_custom_jvp
+def _known(value: Any, function: Any, inputs: Any) -> Any:
+    return value
+
+
+@_known.def_jvp
+def _known_jvp(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
+    value, function, inputs = primals
+    moving, fixed, inputs_dot = _split(inputs, tangents[2])
+    _, value_dot = jax.jvp(lambda moving: function(*eqx.combine(moving, fixed)), (moving,), (inputs_dot,))
+    return value, _tangent(value_dot)
+
+
+def _split(inputs: Any, tangents: Any) -> tuple[Any, Any, Any]:
+    """Return the leaves that have a tangent, the other leaves, and the tangents."""
+    still = jax.tree.map(lambda tangent: tangent is None, tangents, is_leaf=lambda leaf: leaf is None)
+    fixed, moving = eqx.partition(inputs, still)
+    return moving, fixed, tangents
+
+
+def _still(tree: Any) -> Any:
+    return jax.tree.map(lambda leaf: None, tree)
+
+
+def _tangent(tree: Any) -> Any:
+    """Return tangents with None in place of those of integers and booleans."""
+    return jax.tree.map(lambda leaf: leaf if eqx.is_inexact_array(leaf) else None, tree)
