@@ -8,7 +8,7 @@ import re
 import sys
 import traceback
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional, arg
@@ -137,6 +137,66 @@ def evaluate(
     from lio_jax.commands.evaluate import evaluate as command
 
     command(estimate, reference, json)
+
+
+@app.command(name="tune")
+def tune(
+    data: Positional[Annotated[tuple[Path, ...], arg(metavar="DATA [DATA ...]")]],
+    params: Annotated[str, arg(metavar="GLOB,...")],
+    out: Annotated[Path, arg(metavar="DIR")],
+    objective: Annotated[str, arg(metavar="NAME")] = "noise",
+    recipe: Annotated[str, arg(metavar="NAME|FILE.yaml")] = "default",
+    set_: Assignments = (),
+    validate: Annotated[tuple[Path, ...], arg(metavar="DATA ...")] = (),
+    gt: Annotated[Path | None, arg(metavar="FILE")] = None,
+    optimizer: Literal["auto", "scoring", "lbfgsb", "adam"] = "auto",
+    iterations: Annotated[int, arg(metavar="N")] = 40,
+    patience: Annotated[int, arg(metavar="N")] = 10,
+    start: Annotated[int, arg(metavar="N")] = 0,
+    scans: Annotated[int | None, arg(metavar="N")] = None,
+    segment: Annotated[int | None, arg(metavar="N")] = None,
+    seed: Annotated[int, arg(metavar="K")] = 0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Tune parameters by gradient; with the objective noise no ground truth is needed.
+
+    Args:
+        data: Recordings to tune on.
+        params: Parameters, such as imu.gyro_noise,imu.accel_noise or extrinsics.*.
+        out: Folder for tuned.yaml, history.json and tuning.png; an earlier tuning there is gone on with.
+        objective: noise, pose, point, planes, map, ate, rpe, rpe-rotation, or a sum such as ate+0.01*pose.
+        recipe: Recipe or settings file to start from.
+        validate: Recordings that decide which iterate is taken and when to stop.
+        gt: Ground truth of T_world_imu; None means the recordings' own.
+        optimizer: auto takes scoring for likelihoods and lbfgsb for the others; adam steps on segments.
+        iterations: Evaluations at most.
+        patience: Evaluations without a better one before the tuning ends.
+        start: First scan.
+        scans: How many scans of each recording; None means all.
+        segment: Cut recordings into pieces of this many scans, each with a start of its own.
+        seed: Of the segments that adam draws.
+        overwrite: Begin anew where an earlier tuning is in the folder.
+    """
+    from lio_jax.commands.runtime import prepare_jax
+    from lio_jax.commands.tune import TuneOptions
+    from lio_jax.commands.tune import tune as command
+
+    prepare_jax()
+    options = TuneOptions(
+        recipe,
+        set_,
+        params,
+        objective,
+        optimizer,
+        iterations,
+        patience,
+        start,
+        scans,
+        segment,
+        seed,
+        overwrite,
+    )
+    command(data, validate, gt, out, options)
 
 
 @app.command(name="calibrate-imu")

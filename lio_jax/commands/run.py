@@ -47,7 +47,7 @@ def run(
         raise UsageError(f"--start must be 0 or more and --scans 1 or more, not {start} and {scans}.")
     settings = resolve_settings(recipe, assignments)
     sequence = open_sequence(data, settings.config.data)
-    truth = _truth(sequence, gt)
+    truth = truth_of(sequence, gt)
     run_and_report(sequence, settings, out, start, scans, truth, overwrite)
 
 
@@ -155,7 +155,12 @@ def _advance(bar: Any) -> None:
     bar.update()
 
 
-def _truth(sequence: Sequence, gt: Path | None) -> Trajectory | None:
+def truth_of(sequence: Sequence, gt: Path | None) -> Trajectory | None:
+    """Return the recording's ground truth, or the one that a file holds.
+
+    Raises:
+        UsageError: the file has no time stamps.
+    """
     if gt is None:
         return sequence.truth()
     from lio_jax.evaluation.load import load_trajectory

@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from lio_jax.core.config import Config
 from lio_jax.core.params import Params
 from lio_jax.core.settings import Settings
+from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.data.sequence import LidarScan
 from lio_jax.recipes import recipe_named
 from lio_jax.run.failures import Evidence, failure_of, longest_gap
@@ -92,11 +93,58 @@ def track(
         step: a compiled step of the same settings, to reuse its programs over several recordings.
     """
     step = step or CompiledStep(settings)
-    state: Any = None
-    before: Any = None
-    last_end_ns, last_count, size = None, 0, 0
-    opening: list[Any] = []
     last_evidence: Evidence | None = None
+    compiled_s = step.compile_s
+    for fed, state, output in stepped(step, feed(settings, scans, imu)):
+        nav, result = jax.tree.map(np.array, (state.nav, output.registration))
+        lost, nis = bool(output.lost), float(output.nis)
+        done = time.perf_counter()
+        evidence = Evidence(
+            points=fed.count,
+            nav=nav,
+            registration=result,
+            lost=lost,
+            nis=nis,
+            since_last_s=float(fed.scan.interval),
+            imu_gap_s=_imu_gap(fed.imu, fed.scan, nav) if fed.imu else None,
+        )
+        failure = failure_of(evidence, last_evidence, settings)
+        last_evidence = evidence
+        step_ms = (done - fed.padded_at - (step.compile_s - compiled_s)) * 1e3
+        compiled_s = step.compile_s
+        yield Tracked(
+            index=fed.index,
+            stamp_ns=fed.end_ns,
+            T_world_imu=pose_matrix(nav.T_world_imu.wxyz_xyz),
+            nav=nav,
+            output=output,
+            scan_points=fed.count,
+            stage_ms={"pad": fed.pad_ms, "step": step_ms, "total": fed.pad_ms + step_ms},
+            failure=failure,
+        )
+
+
+@dataclass(frozen=True)
+class Fed:
+    """One scan as a step takes it."""
+
+    index: int
+    end_ns: int
+    count: int
+    """Points of the scan as it was recorded."""
+    scan: Scan
+    imu: ImuBatch | None
+    before: ImuBatch | None
+    """Samples up to this scan's end, for a start here; None after the first scan with points."""
+    pad_ms: float
+    padded_at: float
+    """Host time, s."""
+
+
+def feed(settings: Settings, scans: Iterable[LidarScan], imu: ImuFeed | None) -> Iterator[Fed]:
+    """Yield each scan in padded arrays, with the inertial samples that cover it."""
+    last_end_ns, last_count, size = None, 0, 0
+    opened = False
     for index, scan in enumerate(scans):
         start = time.perf_counter()
         count = len(scan.points)
@@ -105,54 +153,55 @@ def track(
             size = bucket_for(count, settings.config.lidar)
         arrays = padded(scan, last_end_ns, settings.config.lidar, size)
         samples = imu.batch(scan, last_end_ns) if imu else None
-        padded_at = time.perf_counter()
-        compiled_s = step.compile_s
-        if state is None or (count and not opening):
-            before = imu.before(scan) if imu else None
-            state = step.initial_state(before)
-        if len(opening) == 1 and count:
-            state = _reopened(step, state, before, opening[0], (arrays, samples))
-        if len(opening) < 2 and count:
-            opening.append((arrays, samples))
-        state, output = step(state, arrays, samples)
-        nav, result = jax.tree.map(np.array, (state.nav, output.registration))
-        lost, nis = bool(output.lost), float(output.nis)
+        before = imu.before(scan) if imu and not opened else None
+        opened = opened or count > 0
         done = time.perf_counter()
-        evidence = Evidence(
-            points=count,
-            nav=nav,
-            registration=result,
-            lost=lost,
-            nis=nis,
-            since_last_s=float(arrays.interval),
-            imu_gap_s=_imu_gap(samples, arrays, nav) if samples else None,
-        )
-        failure = failure_of(evidence, last_evidence, settings)
-        last_end_ns, last_count, last_evidence = scan.end_ns, count, evidence
-        pad_ms = (padded_at - start) * 1e3
-        step_ms = (done - padded_at - (step.compile_s - compiled_s)) * 1e3
-        yield Tracked(
-            index=index,
-            stamp_ns=scan.end_ns,
-            T_world_imu=pose_matrix(nav.T_world_imu.wxyz_xyz),
-            nav=nav,
-            output=output,
-            scan_points=count,
-            stage_ms={"pad": pad_ms, "step": step_ms, "total": pad_ms + step_ms},
-            failure=failure,
-        )
+        yield Fed(index, scan.end_ns, count, arrays, samples, before, (done - start) * 1e3, done)
+        last_end_ns, last_count = scan.end_ns, count
 
 
-def _reopened(step: CompiledStep, state: Any, before: Any, first: Any, second: Any) -> Any:
+class Step(Protocol):
+    """What takes an estimate from scan to scan; its state may be anything."""
+
+    def initial_state(self, imu: ImuBatch | None) -> Any:
+        """Return the state before the first scan; ``imu``: samples up to its end, or None."""
+        ...
+
+    def restarted(self, state: Any, imu: ImuBatch | None) -> Any:
+        """Return the state before the first scan, with the velocity that ``state`` found."""
+        ...
+
+    def __call__(self, state: Any, scan: Scan, imu: ImuBatch | None) -> tuple[Any, Any]:
+        """Return state and output after a scan; ``state`` is consumed."""
+        ...
+
+
+def stepped(step: Step, feed: Iterable[Fed]) -> Iterator[tuple[Fed, Any, Any]]:
+    """Yield each scan with the state and the output after it; the state is consumed by the next one."""
+    state: Any = None
+    first: Fed | None = None
+    reopened = False
+    for fed in feed:
+        if state is None or (fed.count and first is None):
+            state = step.initial_state(fed.before)
+        elif first is not None and fed.count and not reopened:
+            state, reopened = _reopened(step, state, first, fed), True
+        if fed.count and first is None:
+            first = fed
+        state, output = step(state, fed.scan, fed.imu)
+        yield fed, state, output
+
+
+def _reopened(step: Step, state: Any, first: Fed, second: Fed) -> Any:
     """Return the state after the first scan, compensated with the velocity that the second one shows.
 
     Only the second scan tells how fast a vehicle is moving from the start; until then the map holds the first
     scan distorted.
     """
-    if first[0].duration == 0 or first[0].points.shape != second[0].points.shape:
+    if first.scan.duration == 0 or first.scan.points.shape != second.scan.points.shape:
         return state
-    trial, _ = step(state, *second)
-    return step(step.restarted(trial, before), *first)[0]
+    trial, _ = step(state, second.scan, second.imu)
+    return step(step.restarted(trial, first.before), first.scan, first.imu)[0]
 
 
 _STRAGGLER = 0.25

@@ -1,0 +1,238 @@
+"""``lio-jax tune``: parameters by gradient, on recordings of one's own."""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import yaml
+
+from lio_jax.commands.run import resolve_settings, truth_of
+from lio_jax.commands.runtime import say
+from lio_jax.core.errors import UsageError
+from lio_jax.core.files import atomic_path
+from lio_jax.core.settings import Settings
+from lio_jax.data.open import open_sequence
+from lio_jax.run.run import settings_for
+from lio_jax.tuning.loss import Loss
+from lio_jax.tuning.named_objectives import Named, objective_named
+from lio_jax.tuning.optimise import Bounds
+from lio_jax.tuning.parameters import Free, free_parameters
+from lio_jax.tuning.recording import Recording
+from lio_jax.tuning.session import HISTORY, Iterate, Session
+from lio_jax.tuning.values import StreamingValues
+
+Optimiser = Literal["auto", "scoring", "lbfgsb", "adam"]
+
+FACTOR = 1000.0
+"""How far a positive parameter may move from its start, as a factor."""
+TURN, SHIFT, LAG = math.radians(20), 0.5, 0.1
+"""How far an extrinsic may move from its start: rad, m; and the time offset, s."""
+
+
+@dataclass(frozen=True)
+class TuneOptions:
+    """What ``lio-jax tune`` is told beside the recordings."""
+
+    recipe: str
+    assignments: tuple[str, ...]
+    params: str
+    objective: str
+    optimiser: Optimiser
+    iterations: int
+    patience: int
+    start: int
+    scans: int | None
+    segment: int | None
+    seed: int
+    overwrite: bool
+
+
+def tune(
+    data: tuple[Path, ...], validate: tuple[Path, ...], gt: Path | None, out: Path, options: TuneOptions
+) -> None:
+    """Tune from the command line and leave tuned.yaml, history.json and tuning.png behind.
+
+    Raises:
+        UsageError: unknown parameters or objective, or truth is needed and missing.
+        LioJaxError: a recording can't be read, or the objective is not finite at the start.
+    """
+    _check(options, data, gt)
+    named = objective_named(options.objective)
+    optimiser = options.optimiser
+    if optimiser == "auto":
+        optimiser = "scoring" if named.likelihood else "lbfgsb"
+    if optimiser == "scoring" and not named.likelihood:
+        raise UsageError(
+            f"--optimizer scoring wants a likelihood (pose, point, planes, noise), not {options.objective}."
+        )
+    base = resolve_settings(options.recipe, options.assignments)
+    patterns = [word.strip() for word in options.params.split(",") if word.strip()]
+    free_parameters(base.params(), patterns)
+    settings, training = _recordings(data, base, gt, named, options, options.segment)
+    _, validation = _recordings(validate, settings, None, named, replace(options, start=0, scans=None), None)
+    free = free_parameters(settings.params(), patterns)
+    _prepare(out, options.overwrite)
+    session = Session(
+        out,
+        free,
+        Loss(settings.recipe, settings.config, free, named.objective),
+        StreamingValues(settings.recipe, settings.config, free, named.objective),
+        training,
+        validation,
+        named.likelihood,
+        options.patience,
+        lambda iterate: _report(free, iterate),
+    )
+    if session.history:
+        say(f"note: going on after {len(session.history)} evaluations that {out / HISTORY} holds.")
+    first = np.asarray(free.first())
+    with _interruptible(session, out):
+        session.run(optimiser, first, _bounds(free, first), options.iterations, options.seed)
+    _write(out, settings, free, session)
+    print(_table(free, session))
+    print(f"results    {out / 'tuned.yaml'} (use it as --recipe), {HISTORY}, tuning.png")
+
+
+def _check(options: TuneOptions, data: tuple[Path, ...], gt: Path | None) -> None:
+    for name in ("iterations", "patience"):
+        if getattr(options, name) < 1:
+            raise UsageError(f"--{name} must be 1 or more, not {getattr(options, name)}.")
+    if options.start < 0 or (options.scans is not None and options.scans < 2):
+        raise UsageError(
+            f"--start must be 0 or more and --scans 2 or more, not {options.start} and {options.scans}."
+        )
+    if options.segment is not None and options.segment < 20:
+        raise UsageError(
+            f"--segment must be 20 scans or more, not {options.segment}: less tells of the start only."
+        )
+    if gt is not None and len(data) > 1:
+        raise UsageError("--gt goes with one recording; several have to bring their own truth.")
+
+
+def _recordings(
+    paths: tuple[Path, ...],
+    settings: Settings,
+    gt: Path | None,
+    named: Named,
+    options: TuneOptions,
+    segment: int | None,
+) -> tuple[Settings, list[Recording]]:
+    """Return the recordings, or their consecutive segments, and settings with the first one's extrinsics."""
+    recordings: list[Recording] = []
+    for path in paths:
+        sequence = open_sequence(path, settings.config.data)
+        truth = truth_of(sequence, gt)
+        if named.needs_truth and truth is None:
+            raise UsageError(
+                f"{path}: holds no truth, which objective {options.objective} needs; give --gt FILE."
+            )
+        if not recordings:
+            settings, notes = settings_for(sequence, settings)
+            for note in notes:
+                say(f"note: {note}")
+        count = min(options.scans or sequence.info.scan_count, sequence.info.scan_count - options.start)
+        length = segment or count
+        for begin in range(options.start, options.start + max(count - length, 0) + 1, max(length, 1)):
+            recordings.append(Recording(sequence, settings, begin, length, truth))
+            for note in recordings[-1].notes:
+                say(f"note: {note}")
+    return settings, recordings
+
+
+def _bounds(free: Free, first: np.ndarray) -> Bounds:
+    reach = {"rotation": TURN, "translation": SHIFT, "time_offset": LAG}
+    width = np.array([reach.get(name.split(".")[1], math.log(FACTOR)) for name in free.names])
+    upper = first + width
+    for place, name in enumerate(free.names):
+        if name == "registration.information_scale":
+            upper[place] = 0.0
+    return Bounds(first - width, np.maximum(upper, first))
+
+
+def _prepare(out: Path, overwrite: bool) -> None:
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out}: is a file; give a folder.")
+    out.mkdir(parents=True, exist_ok=True)
+    if overwrite:
+        (out / HISTORY).unlink(missing_ok=True)
+
+
+@contextmanager
+def _interruptible(session: Session, out: Path) -> Iterator[None]:
+    """Keep what was computed when Ctrl-C comes, unless nothing was."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if not session.history:
+            raise
+        say(f"interrupted: {len(session.history)} evaluations are kept; the same command goes on from there.")
+
+
+def _report(free: Free, iterate: Iterate) -> None:
+    values = "  ".join(
+        f"{name.split('.', 1)[1]} {value:.4g}" for name, value in _shown(free, iterate).items()
+    )
+    judged = "" if iterate.validation is None else f"  validation {iterate.validation:.6g}"
+    say(f"loss {iterate.value:.6g}{judged}  {values}")
+    if iterate.unconverged:
+        say(
+            f"warning: {iterate.unconverged} of {iterate.scans} scans did not converge; their part of the "
+            "gradient means little (raise config.registration.max_iterations, or start nearer)."
+        )
+
+
+def _shown(free: Free, iterate: Iterate) -> dict[str, float]:
+    """Return the components in their own units: exp of those on a log scale."""
+    return {
+        name: value if name.startswith("extrinsics.") else math.exp(value)
+        for name, value in zip(free.names, iterate.x, strict=True)
+    }
+
+
+def _interval(free: Free, iterate: Iterate) -> dict[str, tuple[float, float]]:
+    """Return each component's 95 % interval where it is known."""
+    if iterate.sigma is None:
+        return {}
+    intervals = {}
+    for name, value, sigma in zip(free.names, iterate.x, iterate.sigma, strict=True):
+        ends = (value - 1.96 * sigma, value + 1.96 * sigma)
+        plain = name.startswith("extrinsics.")
+        intervals[name] = ends if plain else (math.exp(max(ends[0], -700)), math.exp(min(ends[1], 700)))
+    return intervals
+
+
+def _write(out: Path, settings: Settings, free: Free, session: Session) -> None:
+    best = session.best
+    tree: dict = {"recipe": settings.recipe, "params": {}}
+    for path, value in free.overrides(np.asarray(best.x)).items():
+        _, section, name = path.split(".")
+        tree["params"].setdefault(section, {})[name] = value
+    with atomic_path(out / "tuned.yaml") as aside:
+        aside.write_text(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None))
+    from lio_jax.viz.tuning_plot import plot_tuning
+
+    shown = [_shown(free, iterate) for iterate in session.history]
+    losses = {"training": np.array([iterate.value for iterate in session.history])}
+    if best.validation is not None:
+        losses["validation"] = np.array([iterate.validation for iterate in session.history], float)
+    parameters = {name: np.array([one[name] for one in shown]) for name in free.names}
+    plot_tuning(out / "tuning.png", losses, parameters, _interval(free, best), session.history.index(best))
+
+
+def _table(free: Free, session: Session) -> str:
+    first, best = session.history[0], session.best
+    before, after, intervals = _shown(free, first), _shown(free, best), _interval(free, best)
+    lines = [f"{'parameter':42s} {'before':>11s} {'after':>11s}   95 % interval"]
+    for name in free.names:
+        low_high = "" if name not in intervals else "{:.4g} .. {:.4g}".format(*intervals[name])
+        lines.append(f"{name:42s} {before[name]:11.4g} {after[name]:11.4g}   {low_high}")
+    lines.append(f"{'loss on training':42s} {first.value:11.6g} {best.value:11.6g}")
+    if first.validation is not None and best.validation is not None:
+        lines.append(f"{'loss on validation':42s} {first.validation:11.6g} {best.validation:11.6g}")
+    scans = sum(iterate.scans for iterate in session.history)
+    lines.append(f"{len(session.history)} evaluations, {scans} scans with gradient")
+    return "\n".join(lines)

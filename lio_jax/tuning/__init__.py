@@ -1,0 +1,1 @@
+"""Gradients of whole recordings, objectives, and parameters tuned by them."""

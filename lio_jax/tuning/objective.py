@@ -1,0 +1,58 @@
+"""What an objective is: sums that grow from scan to scan, and a value of them."""
+
+from typing import Any, Protocol
+
+import equinox as eqx
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int32
+
+from lio_jax.core.types import NavState
+from lio_jax.recipes.output import Evidence
+
+
+class TruePose(eqx.Module):
+    """Where the vehicle was at a scan's end."""
+
+    T_world_imu: jaxlie.SE3
+    known: Bool[Array, ""]
+    """False where there is no truth."""
+
+
+class Observed(eqx.Module):
+    """What one scan's step leaves to see."""
+
+    nav: NavState
+    """At the scan's end."""
+    rmse: Float[Array, ""]
+    """Robustly weighted root mean square distance of the scan to the map, m."""
+    status: Int32[Array, ""]
+    """Of the solve, see :mod:`lio_jax.estimation.iterated_filter`."""
+    lost: Bool[Array, ""]
+    covariance: Float[Array, "24 24"] | None
+    """Of the navigation state; None from recipes that carry none."""
+    evidence: Evidence | None
+    """How well the scan was foretold; None from recipes that carry no covariance."""
+
+    @staticmethod
+    def of(state: Any, output: Any) -> "Observed":
+        """Return what a recipe's step leaves to see."""
+        result = output.registration
+        return Observed(
+            state.nav, result.rmse, result.status, output.lost, output.covariance, output.evidence
+        )
+
+
+class Objective(Protocol):
+    """A loss over a recording: lower is better. Its sums are a pytree of floating-point arrays."""
+
+    def start(self) -> Any:
+        """Return the sums before the first scan."""
+        ...
+
+    def add(self, sums: Any, seen: Observed, truth: TruePose) -> Any:
+        """Return the sums with one more scan."""
+        ...
+
+    def value(self, sums: Any) -> Float[Array, ""]:
+        """Return the loss."""
+        ...

@@ -1,0 +1,123 @@
+"""The parameters that are tuned, as one vector: positive ones by their logarithm."""
+
+from fnmatch import fnmatchcase
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from lio_jax.core.errors import UsageError
+from lio_jax.core.params import DEFAULTS, DIFFERENTIABLE, Params
+
+_ROTATION = "extrinsics.rotation"
+_ADDED = ("extrinsics.translation", "extrinsics.time_offset")
+
+
+class Free(eqx.Module):
+    """Parameters as a function of a vector x of P numbers.
+
+    A positive leaf is exp(x); translation and time offset are x; a rotation is its start times Exp(x), rad.
+    """
+
+    start: Params
+    """Where ``x`` is :meth:`first`; leaves that are not tuned keep these values."""
+    paths: tuple[str, ...] = eqx.field(static=True)
+    """Leaves that are tuned, such as ``imu.gyro_noise``."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the P components' names: ``imu.gyro_noise``, ``extrinsics.translation.x``."""
+        return tuple(name for path in self.paths for name in _component_names(path))
+
+    def first(self) -> Float[Array, " p"]:
+        """Return the vector of the start."""
+        return jnp.concatenate([_encoded(path, _leaf(self.start, path)) for path in self.paths])
+
+    def __call__(self, x: Float[Array, " p"]) -> Params:
+        """Return the parameters of a vector."""
+        params, used = self.start, 0
+        for path in self.paths:
+            size = len(_component_names(path))
+            value = _decoded(path, x[used : used + size], _leaf(self.start, path))
+            params = eqx.tree_at(partial(_leaf, path=path), params, value)
+            used += size
+        return params
+
+    def overrides(self, x: NDArray[np.float64]) -> dict[str, Any]:
+        """Return the tuned leaves as plain numbers by their settings path, ``params.imu.gyro_noise``."""
+        params = self(jnp.asarray(x))
+        return {f"params.{path}": np.asarray(_leaf(params, path)).tolist() for path in self.paths}
+
+
+def free_parameters(start: Params, patterns: tuple[str, ...] | list[str]) -> Free:
+    """Return the parameters that the patterns name.
+
+    Args:
+        start: values to start from.
+        patterns: paths with or without the leading ``params.``, or globs such as ``imu.*_noise``: of those,
+            the leaves that have a derivative.
+
+    Raises:
+        UsageError: a pattern names no leaf, or only leaves without a derivative, or a leaf to be tuned on a
+            log scale starts at zero.
+    """
+    leaves = [f"{section}.{name}" for section, names in DEFAULTS.items() for name in names]
+    chosen: list[str] = []
+    for pattern in patterns:
+        bare = pattern.removeprefix("params.")
+        named = [leaf for leaf in leaves if fnmatchcase(leaf, bare)]
+        if not named:
+            raise UsageError(f"no parameter is called '{pattern}'; {_choice()}")
+        smooth = [leaf for leaf in named if leaf in DIFFERENTIABLE]
+        if not smooth:
+            raise UsageError(
+                f"'{pattern}' has no derivative, because it only chooses (points, voxels, when to stop); "
+                f"{_choice()}"
+            )
+        starting = [leaf for leaf in smooth if _may_start(start, leaf)]
+        if not starting:
+            raise UsageError(
+                f"'{smooth[0]}' is 0 and would be tuned on a log scale; give it a positive start with "
+                f"--set params.{smooth[0]}=VALUE."
+            )
+        chosen += [leaf for leaf in starting if leaf not in chosen]
+    if not chosen:
+        raise UsageError(f"no parameter to tune was named; {_choice()}")
+    return Free(start, tuple(chosen))
+
+
+def _choice() -> str:
+    return "those that can be tuned: " + ", ".join(DIFFERENTIABLE) + "."
+
+
+def _may_start(start: Params, path: str) -> bool:
+    return path == _ROTATION or path in _ADDED or bool(_leaf(start, path) > 0)
+
+
+def _leaf(params: Params, path: str) -> Array:
+    section, name = path.split(".")
+    return getattr(getattr(params, section), name)
+
+
+def _component_names(path: str) -> tuple[str, ...]:
+    if path in (_ROTATION, "extrinsics.translation"):
+        return tuple(f"{path}.{axis}" for axis in "xyz")
+    return (path,)
+
+
+def _encoded(path: str, value: Array) -> Float[Array, " k"]:
+    if path == _ROTATION:
+        return jnp.zeros(3, value.dtype)
+    return jnp.atleast_1d(value if path in _ADDED else jnp.log(value))
+
+
+def _decoded(path: str, x: Float[Array, " k"], start: Array) -> Array:
+    if path == _ROTATION:
+        turned = jaxlie.SO3.from_quaternion_xyzw(start) @ jaxlie.SO3.exp(x)
+        return turned.normalize().as_quaternion_xyzw()
+    return x.reshape(start.shape) if path in _ADDED else jnp.exp(x.reshape(start.shape))

@@ -1,0 +1,184 @@
+"""One tuning: evaluations are written down as they come, so that a killed one goes on where it was."""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from collections.abc import Sequence as Listing
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.errors import LioJaxError
+from lio_jax.core.files import atomic_path
+from lio_jax.tuning.loss import Evaluated, Loss
+from lio_jax.tuning.optimise import Bounds, adam, fisher_information, lbfgsb, scoring
+from lio_jax.tuning.parameters import Free
+from lio_jax.tuning.recording import Recording
+from lio_jax.tuning.values import StreamingValues
+
+HISTORY = "history.json"
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """One evaluation."""
+
+    x: tuple[float, ...]
+    value: float
+    """Training loss."""
+    gradient: tuple[float, ...]
+    sigma: tuple[float, ...] | None
+    """Standard deviation by the Fisher information; None where the loss is no likelihood."""
+    unconverged: int
+    """Scans whose solve did not converge: with many of them the gradient is not to be trusted."""
+    scans: int
+    """Scans processed in this evaluation."""
+    validation: float | None
+    """Loss on the validation recordings; None where there are none."""
+
+    @property
+    def judged(self) -> float:
+        """Return what decides which iterate is best."""
+        return self.value if self.validation is None else self.validation
+
+
+class EarlyStop(Exception):
+    """The loss has not fallen for long."""
+
+
+class Session:
+    """Evaluates, writes down, judges."""
+
+    def __init__(
+        self,
+        folder: Path,
+        free: Free,
+        loss: Loss,
+        values: StreamingValues,
+        training: Listing[Recording],
+        validation: Listing[Recording],
+        likelihood: bool,
+        patience: int,
+        observer: Callable[[Iterate], None] = lambda iterate: None,
+    ) -> None:
+        """Take up the history that lies in the folder.
+
+        Args:
+            folder: gets ``history.json`` after every evaluation.
+            free: parameters that are tuned.
+            loss: their loss.
+            values: the same objective without gradient, for validation.
+            training: recordings to tune on.
+            validation: recordings to judge by; may be empty.
+            likelihood: the loss is a mean negative log-likelihood.
+            patience: evaluations without a better one before the tuning ends.
+            observer: called after every evaluation.
+
+        Raises:
+            LioJaxError: the history is that of other parameters.
+        """
+        self._path = folder / HISTORY
+        self._free, self._loss, self._values = free, loss, values
+        self._training, self._validation = training, validation
+        self._likelihood, self._patience, self._observer = likelihood, patience, observer
+        self.history: list[Iterate] = _read(self._path, free) if self._path.exists() else []
+
+    @property
+    def best(self) -> Iterate:
+        """Return the iterate with the lowest loss, on the validation recordings where there are any."""
+        finite = [iterate for iterate in self.history if math.isfinite(iterate.judged)]
+        return min(finite, key=lambda iterate: iterate.judged)
+
+    def run(self, optimiser: str, x: NDArray[np.float64], bounds: Bounds, iterations: int, seed: int) -> None:
+        """Minimise from ``x``, or from the last iterate of an earlier, interrupted tuning.
+
+        Args:
+            optimiser: scoring, lbfgsb or adam.
+            x: where to start.
+            bounds: of the vector.
+            iterations: at most, those of the history included.
+            seed: of the segments that adam draws.
+        """
+        start = np.asarray(self.history[-1].x) if self.history else x
+        left = iterations - len(self.history)
+        if left <= 0:
+            return
+        try:
+            if optimiser == "scoring":
+                scoring(self.evaluate, start, bounds, left)
+            elif optimiser == "lbfgsb":
+                lbfgsb(self.evaluate, start, bounds, left)
+            else:
+                adam(self._segments(seed + len(self.history)), start, bounds, left)
+        except EarlyStop:
+            pass
+
+    def evaluate(self, x: NDArray[np.float64], recordings: Listing[Recording] | None = None) -> Evaluated:
+        """Return the loss at ``x`` and write it down.
+
+        Raises:
+            EarlyStop: it has not fallen for long.
+            LioJaxError: the very first value is not finite.
+        """
+        result = self._loss(x, recordings or self._training)
+        if not self.history and not math.isfinite(result.value):
+            raise LioJaxError(
+                "the objective is not finite at the start; check the parameters with lio-jax run first."
+            )
+        sigma = None
+        if self._likelihood:
+            variance = np.diag(np.linalg.inv(fisher_information(result)))
+            sigma = tuple(np.sqrt(np.maximum(variance, 0.0)).tolist())
+        validation = None
+        if self._validation:
+            rows = np.asarray(x)[None]
+            losses = [float(self._values(rows, recording)[0]) for recording in self._validation]
+            validation = float(np.average(losses, weights=[len(recording) for recording in self._validation]))
+        iterate = Iterate(
+            tuple(np.asarray(x).tolist()),
+            result.value,
+            tuple(result.gradient.tolist()),
+            sigma,
+            result.unconverged,
+            result.scans,
+            validation,
+        )
+        self.history.append(iterate)
+        self._write()
+        self._observer(iterate)
+        since = len(self.history) - 1 - self.history.index(self.best)
+        if since >= self._patience:
+            raise EarlyStop
+        return result
+
+    def _segments(self, seed: int) -> Iterator[Callable[[NDArray[np.float64]], Evaluated]]:
+        """Yield the loss over one recording after the other, drawn at random."""
+        random = np.random.default_rng(seed)
+        while True:
+            chosen = self._training[int(random.integers(len(self._training)))]
+            yield partial(self.evaluate, recordings=[chosen])
+
+    def _write(self) -> None:
+        held: dict[str, Any] = {"names": self._free.names, "iterates": [asdict(one) for one in self.history]}
+        with atomic_path(self._path) as aside:
+            aside.write_text(json.dumps(held, indent=1) + "\n")
+
+
+def _read(path: Path, free: Free) -> list[Iterate]:
+    held = json.loads(path.read_text())
+    if tuple(held["names"]) != free.names:
+        raise LioJaxError(
+            f"{path}: is the history of other parameters ({', '.join(held['names'])}); "
+            "give another --out, or --overwrite to begin anew."
+        )
+    iterates = []
+    for one in held["iterates"]:
+        row: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in one.items()
+        }
+        iterates.append(Iterate(**row))
+    return iterates

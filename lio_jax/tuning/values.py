@@ -1,0 +1,59 @@
+"""An objective at several vectors of parameters at once."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.config import Config
+from lio_jax.recipes import recipe_named
+from lio_jax.run.track import stepped
+from lio_jax.tuning.objective import Objective, Observed
+from lio_jax.tuning.parameters import Free
+from lio_jax.tuning.recording import Recording
+
+
+class StreamingValues:
+    """An objective at several vectors of parameters at once: one program, batched over them."""
+
+    def __init__(self, recipe: str, config: Config, free: Free, objective: Objective) -> None:
+        """Keep what shapes the programs."""
+        module = recipe_named(recipe)
+        self._objective = objective
+
+        def one(x: Any, state: Any, scan: Any, imu: Any) -> tuple[Any, Observed]:
+            state, output = module.step(config, free(x), state, scan, imu)
+            return state, Observed.of(state, output)
+
+        self._init = jax.jit(jax.vmap(lambda x, imu: module.init(config, free(x), imu), (0, None)))
+        self._restart = jax.jit(
+            jax.vmap(lambda x, state, imu: module.restart(config, free(x), state, imu), (0, 0, None))
+        )
+        self._step = jax.jit(jax.vmap(one, (0, 0, None, None)), donate_argnums=1)
+        self._add = jax.jit(jax.vmap(objective.add, (0, 0, None)))
+        self._value = jax.jit(jax.vmap(objective.value))
+
+    def __call__(self, xs: NDArray[np.float64], recording: Recording) -> NDArray[np.float64]:
+        """Return the objective at each row of ``xs``."""
+        x = jnp.asarray(xs)
+        sums = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (len(x), *leaf.shape)), self._objective.start()
+        )
+        for fed, _, seen in stepped(_Batch(self, x), recording.feed()):
+            sums = self._add(sums, seen, recording.truth_at(fed.end_ns))
+        return np.asarray(self._value(sums))
+
+
+class _Batch:
+    """A :class:`lio_jax.run.track.Step` over a batch of states."""
+
+    def __init__(self, programs: StreamingValues, x: Any) -> None:
+        self.initial_state = partial(programs._init, x)
+        self.restarted = partial(programs._restart, x)
+        self._step = partial(programs._step, x)
+
+    def __call__(self, state: Any, scan: Any, imu: Any) -> tuple[Any, Any]:
+        return self._step(state, scan, imu)

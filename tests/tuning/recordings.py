@@ -1,0 +1,60 @@
+"""A short simulated drive in double precision, and settings under which solves converge to the last digit."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax.numpy as jnp
+import numpy as np
+
+from lio_jax.core.params import DEFAULTS
+from lio_jax.core.settings import Settings, recipe_settings, with_overrides
+from lio_jax.run.run import settings_for
+from lio_jax.run.track import Fed
+from lio_jax.sim.imu import ImuModel
+from lio_jax.sim.sequence import SimulatedSequence
+from lio_jax.tuning.recording import Recording
+
+SCANS = 20
+SMALL = [
+    "config.lidar.buckets=[4096]",
+    "config.lidar.registration_points=1024",
+    "config.lidar.insertion_points=4096",
+    "config.imu.buckets=[64]",
+    "config.imu.registration_points=1024",
+    "config.imu.insertion_points=4096",
+    "config.map.capacity=32768",
+]
+TIGHT = ["params.registration.rotation_tolerance=1e-12", "params.registration.translation_tolerance=1e-12"]
+
+
+@cache
+def drive() -> SimulatedSequence:
+    """Return a drive that has begun before the first scan."""
+    return SimulatedSequence(
+        duration_s=SCANS * 0.1, beams=16, columns=256, seed=3, imu=ImuModel(), moving_start=True
+    )
+
+
+def settings(recipe: str, inertial: bool, *more: str) -> Settings:
+    """Return a recipe's settings with a small program and every sigma above zero."""
+    section = DEFAULTS["initial"]
+    positive = [f"params.initial.{name}={value or 0.01}" for name, value in section.items()]
+    overrides = [*SMALL, *positive, "params.lidar.angle_sigma=0.001", *more]
+    if not inertial:
+        overrides.append("config.imu.use=false")
+    return settings_for(drive(), with_overrides(recipe_settings(recipe), overrides))[0]
+
+
+class DoubleRecording(Recording):
+    """Scans whose points are held in double precision."""
+
+    def feed(self):
+        for fed in super().feed():
+            scan = replace(
+                fed.scan,
+                points=np.asarray(fed.scan.points, np.float64),
+                time=np.asarray(fed.scan.time, np.float64),
+                duration=jnp.float64(fed.scan.duration),
+                interval=jnp.float64(fed.scan.interval),
+            )
+            yield Fed(**{**vars(fed), "scan": scan})

@@ -1,0 +1,96 @@
+"""Streaming gradients against central differences, for every recipe and every differentiable leaf."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lio_jax.core.params import DIFFERENTIABLE
+from lio_jax.recipes import RECIPES
+from lio_jax.run.track import CompiledStep, stepped
+from lio_jax.tuning.objective import Observed
+from lio_jax.tuning.parameters import free_parameters
+from lio_jax.tuning.streaming import StreamingGradient
+from tests.tuning.recordings import TIGHT, DoubleRecording, drive, settings
+
+STEPS = {"imu.gyro_bias_walk": 1e-3, "imu.accel_bias_walk": 1e-3, "extrinsics": 1e-8}
+"""Small where points move, lest they find another plane; large where hardly anything does."""
+
+
+class Everything(eqx.Module):
+    """Weighs all that a scan leaves to see: trajectory, velocity, biases, covariance, innovations."""
+
+    def start(self):
+        return jnp.zeros(())
+
+    def add(self, sums, seen, truth):
+        smooth = [
+            seen.nav.T_world_imu.wxyz_xyz,
+            seen.nav.velocity,
+            10 * seen.nav.gyro_bias,
+            seen.nav.accel_bias,
+            seen.nav.gravity,
+            seen.rmse[None],
+        ]
+        if seen.covariance is not None:
+            smooth.append(jnp.log(jnp.diagonal(seen.covariance)[:15]))
+            smooth.append(-0.01 * seen.evidence.innovation.log_likelihood()[None])
+        values = jnp.concatenate(smooth)
+        return sums + values @ jnp.sin(1.0 + jnp.arange(len(values)))
+
+    def value(self, sums):
+        return sums
+
+
+class HeldMap:
+    """A recipe's step that sees the maps of another run instead of its own."""
+
+    def __init__(self, chosen, params, maps):
+        self.step = CompiledStep(chosen) if maps is None else maps.step
+        self.step.params = params
+        self.maps = [] if maps is None else maps.maps
+        self.replayed = maps is not None
+        self.count = 0
+
+    def initial_state(self, imu):
+        return self.step.initial_state(imu)
+
+    def restarted(self, state, imu):
+        return self.step.restarted(state, imu)
+
+    def __call__(self, state, scan, imu):
+        if not self.replayed:
+            self.maps.append(jax.tree.map(jnp.copy, state.map))
+        state = eqx.tree_at(lambda tree: tree.map, state, jax.tree.map(jnp.copy, self.maps[self.count]))
+        self.count += 1
+        return self.step(state, scan, imu)
+
+
+def total(held, recording):
+    objective, sums = Everything(), jnp.zeros(())
+    for fed, state, output in stepped(held, recording.feed()):
+        sums = objective.add(sums, Observed.of(state, output), recording.truth_at(fed.end_ns))
+    return float(sums)
+
+
+@pytest.mark.parametrize("inertial", [True, False], ids=["inertial", "lidar only"])
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_gradients_of_every_leaf_agree_with_central_differences(recipe, inertial):
+    chosen = settings(recipe, inertial, *TIGHT)
+    recording = DoubleRecording(drive(), chosen)
+    free = free_parameters(chosen.params(), DIFFERENTIABLE)
+    assert set(free.paths) == set(DIFFERENTIABLE)
+    x = np.asarray(free.first())
+    result = StreamingGradient(recipe, chosen.config, free, Everything())(x, recording)
+
+    nominal = HeldMap(chosen, chosen.params(), None)
+    # two programs round differently, and so do the maps they build
+    assert total(nominal, recording) == pytest.approx(result.value, rel=1e-5)
+    assert not result.unconverged
+    for component, name in enumerate(free.names):
+        step = STEPS.get(name, STEPS.get(name.split(".")[0], 1e-5))
+        ends = [x + sign * step * (np.arange(len(x)) == component) for sign in (1, -1)]
+        high, low = (total(HeldMap(chosen, free(end), nominal), recording) for end in ends)
+        difference = (high - low) / (2 * step)
+        assert result.gradient[component] == pytest.approx(difference, rel=1e-4, abs=1e-6), name
