@@ -19,8 +19,9 @@ from lio_jax.core.error_state import (
     sphere_basis,
 )
 from lio_jax.core.params import ImuParams, InitialParams
+from lio_jax.core.prefix_sum import running_count
+from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.core.types import ImuBatch, NavState, initial_nav_state
-from lio_jax.imu.rotation_integrals import skew
 
 MIN_SAMPLES = 5
 """Fewer samples cannot show that the vehicle is at rest."""
@@ -172,7 +173,7 @@ def _seen_at_rest(
     H = H.at[:3, GYRO_BIAS].set(jnp.where(use_gyro, jnp.eye(3), 0.0))
     H = H.at[3:, ACCEL_BIAS].set(jnp.eye(3))
     H = H.at[3:, ROTATION].set(skew(force))
-    H = H.at[3:, GRAVITY].set(back.as_matrix() @ skew(nav.gravity) @ sphere_basis(nav.gravity))
+    H = H.at[3:, GRAVITY].set(rotation_matrix(back) @ skew(nav.gravity) @ sphere_basis(nav.gravity))
     # an unused row has no variance of its own and would make the system singular
     gyro_variance = jnp.where(use_gyro, gyro_variance, 1.0)
     R = jnp.diag(jnp.repeat(jnp.stack([gyro_variance, accel_variance]), 3))
@@ -200,7 +201,7 @@ def _is_steady(
     tolerance: float,
 ) -> Bool[Array, ""]:
     """Return whether scatter and drift are those of a sensor at rest."""
-    rank = jnp.cumsum(mask)
+    rank = running_count(mask)
     early, _ = _mean_and_variance(samples, mask & (rank * 2 <= rank[-1]))
     late, _ = _mean_and_variance(samples, mask & (rank * 2 > rank[-1]))
     half = jnp.maximum(rank[-1] / 2, 1.0)

@@ -69,7 +69,7 @@ def nearest_points(
     # along each axis the eight blocks end with the query's own block on one side, one later on the other
     sure = edge * jnp.min(jnp.maximum(fraction, 1 - fraction), axis=-1)
     unsure = mask & (found.squared_distance[-1] > sure**2)
-    rank = jnp.cumsum(unsure.astype(jnp.int32)) - 1
+    rank = running_count(unsure) - 1
     waiting = jnp.full(count, count, jnp.int32).at[jnp.where(unsure, rank, count)].set(order, mode="drop")
     return search.over(found, waiting, rank[-1] + 1, jnp.array(_AROUND, jnp.int32), _WIDE_CHUNK)
 

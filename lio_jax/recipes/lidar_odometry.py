@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int32
 
 from lio_jax.core.config import Config
 from lio_jax.core.params import Params
+from lio_jax.core.rotation import rotation_matrix
 from lio_jax.core.types import NavState, Scan, initial_nav_state
 from lio_jax.lidar.deskew import deskew_constant_velocity
 from lio_jax.lidar.thinning import thinned
@@ -116,7 +117,7 @@ def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[Stat
         anchor, corner = anchor_of(T.translation(), params.map.voxel_size)
         shift = (T.translation() - corner).astype(jnp.float32)
         deskewed = deskew_constant_velocity(thin.points, delay, twist)
-        anchored = deskewed @ T.rotation().as_matrix().astype(jnp.float32).T + shift
+        anchored = deskewed @ rotation_matrix(T.rotation()).astype(jnp.float32).T + shift
         vmap, added = insert(
             state.map,
             anchored,
