@@ -53,9 +53,9 @@ def rotation_series(angle_squared: Float[Array, "*b"]) -> tuple[Array, Array, Ar
 
 def _series(x: Float[Array, "*b"], order: int | NDArray[np.intp]) -> Array:
     """Return the sum over k of (-x)^k / (2 k + order)!."""
-    total = jnp.zeros_like(x)
+    total: Array = jnp.zeros_like(x)
     for k in reversed(range(_TERMS)):
-        total = (1 / _FACTORIALS[2 * k + order]).astype(x.dtype) - x * total
+        total = -x * total + np.asarray(1 / _FACTORIALS[2 * k + order], x.dtype)
     return total
 
 

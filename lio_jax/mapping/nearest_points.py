@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float32, Int32
 
 from lio_jax.core.materialise import materialised
+from lio_jax.core.prefix_sum import running_count
 from lio_jax.mapping.hash_slots import find_slots
 from lio_jax.mapping.point_map import EDGE, VOXELS, PointMap
 
