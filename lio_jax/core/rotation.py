@@ -9,8 +9,8 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-_ENTRY = np.array([[0, 2, 1], [2, 0, 0], [1, 0, 0]])
-_SIGN = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]])
+_ENTRY = np.array([[0, 2, 1], [2, 0, 0], [1, 0, 0]], np.int32)
+_SIGN = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]], np.int32)
 
 
 def skew(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:

@@ -1,12 +1,10 @@
 """What the recipes with an error-state filter share: the start, the prediction and the form of the result."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from lio_jax.core.blocks import from_blocks
 from lio_jax.core.error_state import (
@@ -29,13 +27,12 @@ from lio_jax.imu.strapdown import propagate
 from lio_jax.registration.scan_to_map import NormalEquations, Registration
 
 
-def levelled_start(params: Params, imu: ImuBatch, velocity: Float[Array, "3"] | None) -> Uncertain:
-    """Return the state at the world's origin, levelled by the samples.
+def levelled_start(params: Params, imu: ImuBatch) -> Uncertain:
+    """Return the state at the world's origin, levelled by the samples, as if the vehicle were at rest.
 
     Args:
         params: traced.
         imu: samples of about a second up to the first scan's end.
-        velocity: in world, m/s, where it is known; None: that of a vehicle at rest.
     """
     start = initialise_at_rest(
         imu,
@@ -44,8 +41,7 @@ def levelled_start(params: Params, imu: ImuBatch, velocity: Float[Array, "3"] | 
         params.extrinsics.T_imu_lidar(),
         params.extrinsics.time_offset,
     )
-    nav = start.start.nav if velocity is None else dataclasses.replace(start.start.nav, velocity=velocity)
-    return held_at_lidar(Uncertain(nav, start.start.covariance))
+    return held_at_lidar(start.start)
 
 
 def held_at_lidar(state: Uncertain) -> Uncertain:
