@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
+from lio_jax.core.rotation import rotation_matrix
 from lio_jax.core.types import NavState
 
 DOF = 24
@@ -22,6 +23,8 @@ GYRO_BIAS = slice(9, 12)
 """rad/s."""
 ACCEL_BIAS = slice(12, 15)
 """m/s^2."""
+BIASES = slice(9, 15)
+"""Both of them."""
 GRAVITY = slice(15, 17)
 """rad, about the two axes of ``sphere_basis``."""
 EXTRINSIC_ROTATION = slice(17, 20)
@@ -34,18 +37,20 @@ TIME_OFFSET = slice(23, 24)
 
 def retract(nav: NavState, error: Float[Array, "24"]) -> NavState:
     """Return ``nav [+] error``."""
-    rotation = nav.T_world_imu.rotation()
-    turned = _unit(rotation @ jaxlie.SO3.exp(error[ROTATION]))
-    position = nav.T_world_imu.translation() + rotation @ error[POSITION]
-    extrinsic = _unit(nav.T_imu_lidar.rotation() @ jaxlie.SO3.exp(error[EXTRINSIC_ROTATION]))
+    rotation, extrinsic = nav.T_world_imu.rotation(), nav.T_imu_lidar.rotation()
+    fall = sphere_basis(nav.gravity) @ error[GRAVITY]
+    # in batches, because each operation on its own compiles a kernel
+    turns = jaxlie.SO3.exp(jnp.stack([error[ROTATION], error[EXTRINSIC_ROTATION], fall])).wxyz
+    turned = _unit(jaxlie.SO3(jnp.stack([rotation.wxyz, extrinsic.wxyz])) @ jaxlie.SO3(turns[:2])).wxyz
+    moved, sped = jnp.stack([error[POSITION], error[VELOCITY]]) @ rotation_matrix(rotation).T
     return NavState(
-        T_world_imu=jaxlie.SE3.from_rotation_and_translation(turned, position),
-        velocity=nav.velocity + rotation @ error[VELOCITY],
+        T_world_imu=jaxlie.SE3(jnp.concatenate([turned[0], nav.T_world_imu.translation() + moved])),
+        velocity=nav.velocity + sped,
         gyro_bias=nav.gyro_bias + error[GYRO_BIAS],
         accel_bias=nav.accel_bias + error[ACCEL_BIAS],
-        gravity=jaxlie.SO3.exp(sphere_basis(nav.gravity) @ error[GRAVITY]) @ nav.gravity,
-        T_imu_lidar=jaxlie.SE3.from_rotation_and_translation(
-            extrinsic, nav.T_imu_lidar.translation() + error[EXTRINSIC_TRANSLATION]
+        gravity=rotation_matrix(jaxlie.SO3(turns[2])) @ nav.gravity,
+        T_imu_lidar=jaxlie.SE3(
+            jnp.concatenate([turned[1], nav.T_imu_lidar.translation() + error[EXTRINSIC_TRANSLATION]])
         ),
         time_offset=nav.time_offset + error[TIME_OFFSET][0],
     )
@@ -75,20 +80,14 @@ def sphere_basis(gravity: Float[Array, "3"]) -> Float[Array, "3 2"]:
     """Return two unit axes normal to ``gravity`` and to each other, smooth near the vertical."""
     up = -gravity / jnp.linalg.norm(gravity)
     # the rotation that takes +z to up, applied to x and y; singular only for gravity that points up
-    a = 1 / (1 + up[2])
-    b = -up[0] * up[1] * a
-    return jnp.stack(
-        [
-            jnp.array([1 - up[0] ** 2 * a, b, -up[0]]),
-            jnp.array([b, 1 - up[1] ** 2 * a, -up[1]]),
-        ],
-        axis=1,
-    )
+    axes = jnp.eye(3, dtype=up.dtype)
+    between = up + axes[2]
+    return axes[:, :2] - jnp.outer(between / between[2], up[:2])
 
 
 def _unit(rotation: jaxlie.SO3) -> jaxlie.SO3:
-    """Return the rotation at unit length, to the last bit as it is where it already has unit length."""
-    square = jnp.sum(rotation.wxyz**2)
+    """Return the rotations at unit length, to the last bit as they are where that is their length."""
+    square = jnp.sum(rotation.wxyz**2, axis=-1, keepdims=True)
     # dividing by a norm that is one but for rounding would let a frozen rotation's last bits wander
     as_it_is = jnp.abs(square - 1) < 8 * jnp.finfo(square.dtype).eps
     return jaxlie.SO3(rotation.wxyz / jnp.where(as_it_is, 1.0, jnp.sqrt(square)))

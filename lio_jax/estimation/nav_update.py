@@ -4,15 +4,18 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Float
 
+from lio_jax.core.blocks import from_blocks
 from lio_jax.core.error_state import (
+    BIASES,
     DOF,
     EXTRINSIC_ROTATION,
+    EXTRINSIC_TRANSLATION,
     GRAVITY,
     POSITION,
     ROTATION,
+    TIME_OFFSET,
     VELOCITY,
     Uncertain,
     local,
@@ -22,7 +25,7 @@ from lio_jax.core.error_state import (
 from lio_jax.core.types import NavState
 from lio_jax.estimation.iterated_filter import Measurement, Update, iterated_update
 from lio_jax.estimation.pose_measurement import lidar_pose_jacobian
-from lio_jax.imu.rotation_integrals import rotation_integrals
+from lio_jax.imu.rotation_integrals import rotation_exponential, rotation_integrals
 
 
 def update_nav(
@@ -72,18 +75,18 @@ def reset_jacobian(nav: NavState, error: Float[Array, "24"]) -> Float[Array, "24
     right Jacobians for the rotations, the rotation back for position and velocity, and on the gravity sphere
     the left Jacobian between the two bases.
     """
-    back = jaxlie.SO3.exp(-error[ROTATION]).as_matrix()
     basis = sphere_basis(nav.gravity)
-    turn = basis @ error[GRAVITY]
-    turned_basis = sphere_basis(jaxlie.SO3.exp(turn) @ nav.gravity)
+    turns = jnp.stack([-error[ROTATION], -error[EXTRINSIC_ROTATION], basis @ error[GRAVITY]])
+    back, _, turn = rotation_exponential(turns)
+    jacobian, extrinsic_jacobian, gravity_jacobian = rotation_integrals(turns)[0]
+    identity = jnp.eye(DOF, dtype=error.dtype)
     blocks = (
-        (ROTATION, rotation_integrals(-error[ROTATION])[0]),
+        (ROTATION, jacobian),
         (POSITION, back),
         (VELOCITY, back),
-        (GRAVITY, turned_basis.T @ rotation_integrals(turn)[0] @ basis),
-        (EXTRINSIC_ROTATION, rotation_integrals(-error[EXTRINSIC_ROTATION])[0]),
+        (BIASES, identity[:6, :6]),
+        (GRAVITY, sphere_basis(turn @ nav.gravity).T @ gravity_jacobian @ basis),
+        (EXTRINSIC_ROTATION, extrinsic_jacobian),
+        (slice(EXTRINSIC_TRANSLATION.start, TIME_OFFSET.stop), identity[:4, :4]),
     )
-    reset = jnp.eye(DOF, dtype=error.dtype)
-    for part, block in blocks:
-        reset = reset.at[part, part].set(block)
-    return reset
+    return from_blocks((DOF, DOF), *((part, part, block) for part, block in blocks))

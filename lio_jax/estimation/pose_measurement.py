@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
+from lio_jax.core.blocks import from_blocks
 from lio_jax.core.error_state import DOF, EXTRINSIC_ROTATION, EXTRINSIC_TRANSLATION, POSITION, ROTATION
+from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.core.types import NavState
 from lio_jax.estimation.iterated_filter import Measurement
-from lio_jax.imu.rotation_integrals import skew
 
 
 def lidar_pose_jacobian(nav: NavState) -> Float[Array, "6 24"]:
@@ -23,14 +24,17 @@ def lidar_pose_jacobian(nav: NavState) -> Float[Array, "6 24"]:
     lidar's twist belongs to the other convention, states kept by the IMU's clock: here it would count the
     offset twice.
     """
-    R_world_imu = nav.T_world_imu.rotation().as_matrix()
-    R_world_lidar = R_world_imu @ nav.T_imu_lidar.rotation().as_matrix()
-    jacobian = jnp.zeros((6, DOF), R_world_imu.dtype)
-    jacobian = jacobian.at[:3, ROTATION].set(R_world_imu)
-    jacobian = jacobian.at[3:, ROTATION].set(-R_world_imu @ skew(nav.T_imu_lidar.translation()))
-    jacobian = jacobian.at[3:, POSITION].set(R_world_imu)
-    jacobian = jacobian.at[:3, EXTRINSIC_ROTATION].set(R_world_lidar)
-    return jacobian.at[3:, EXTRINSIC_TRANSLATION].set(R_world_imu)
+    R_world_imu = rotation_matrix(nav.T_world_imu.rotation())
+    R_world_lidar = R_world_imu @ rotation_matrix(nav.T_imu_lidar.rotation())
+    turn, move = slice(0, 3), slice(3, 6)
+    return from_blocks(
+        (6, DOF),
+        (turn, ROTATION, R_world_imu),
+        (move, ROTATION, -R_world_imu @ skew(nav.T_imu_lidar.translation())),
+        (move, POSITION, R_world_imu),
+        (turn, EXTRINSIC_ROTATION, R_world_lidar),
+        (move, EXTRINSIC_TRANSLATION, R_world_imu),
+    )
 
 
 def keep_observed(
@@ -109,7 +113,7 @@ def measured_pose(nav: NavState, T_world_lidar: jaxlie.SE3, information: Float[A
     predicted = nav.T_world_imu @ nav.T_imu_lidar
     missed = T_world_lidar.inverse() @ predicted
     residual = jnp.concatenate([missed.rotation().log(), missed.translation()])
-    to_measured = T_world_lidar.rotation().inverse().as_matrix()
+    to_measured = rotation_matrix(T_world_lidar.rotation().inverse())
     H = jnp.zeros((6, 6), residual.dtype)
     # Exp(turn) on the left of the residual's rotation acts through its inverse left Jacobian
     H = H.at[:3, :3].set(missed.rotation().inverse().jlog() @ to_measured).at[3:, 3:].set(to_measured)

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 from lio_jax.core.error_state import POSITION, ROTATION, VELOCITY
 from lio_jax.core.params import ImuParams, InitialParams
+from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.imu.preintegration import Preintegrated
-from lio_jax.imu.rotation_integrals import skew
 
 SPHERE_ROUNDS = 4
 
@@ -85,7 +85,7 @@ def align(
     turn = matrices[:-1]
     matched = T_near_imu.translation()
 
-    gained_frame = gain.rotation.as_matrix()
+    gained_frame = rotation_matrix(gain.rotation)
     speed_by_bias = gained_frame @ gain.bias_jacobian[:, VELOCITY, 3:]
     way_by_bias = gained_frame @ gain.bias_jacobian[:, POSITION, 3:]
 

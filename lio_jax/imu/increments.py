@@ -12,7 +12,11 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from lio_jax.imu.rotation_integrals import integral_derivatives, rotation_integrals, skew
+from lio_jax.core.blocks import from_blocks
+from lio_jax.core.error_state import POSITION, ROTATION, VELOCITY
+from lio_jax.core.prefix_sum import prefix_sum
+from lio_jax.core.rotation import rotation_matrix, skew
+from lio_jax.imu.rotation_integrals import integral_derivatives, rotation_exponential, rotation_integrals
 
 NAV_DOF = 9
 """Rotation, position, velocity, in the frame of the last instant: the order of the error state."""
@@ -37,10 +41,8 @@ class Sensitivity(eqx.Module):
     The error is a right perturbation: rotation, position and velocity in the last knot's frame.
     """
 
-    rate: Float[Array, "n 9 3"]
-    """Per angular rate, s."""
-    accel: Float[Array, "n 9 3"]
-    """Per specific force."""
+    inputs: Float[Array, "n 9 6"]
+    """Per angular rate, s, then per specific force."""
     duration: Float[Array, "n 9"]
     """Per duration, with the end at its time."""
 
@@ -71,7 +73,7 @@ def accumulate(
     unit = jnp.zeros_like(turn[:1]).at[0, 0].set(1)
     rotation = jaxlie.SO3(jnp.concatenate([unit, products])).normalize()
     gained, moved = _gain(rate, accel, duration, turning)
-    matrix = rotation.as_matrix()[:-1]
+    matrix = rotation_matrix(rotation)[:-1]
     velocity = _knots(jnp.einsum("nij,nj->ni", matrix, gained))
     position = _knots(jnp.einsum("nij,nj->ni", matrix, moved) + velocity[:-1] * duration[:, None])
     return Increments(_knots(duration), rotation, velocity, position)
@@ -85,7 +87,7 @@ def sensitivity(
     turning: bool = True,
 ) -> Sensitivity:
     """Return how the last of :func:`accumulate`'s increments depends on each interval's inputs."""
-    matrix = increments.rotation.as_matrix()
+    matrix = rotation_matrix(increments.rotation)
     start, back = matrix[:-1], matrix[-1].T
     first, second = _integrals(rate * duration[:, None], turning)
 
@@ -113,7 +115,7 @@ def sensitivity(
         1,
     )
     final = final.reshape(-1, NAV_DOF, 7)
-    return Sensitivity(final[..., :3], final[..., 3:6], final[..., 6])
+    return Sensitivity(final[..., :6], final[..., 6])
 
 
 def nav_transition(
@@ -125,11 +127,17 @@ def nav_transition(
         rotation: gained, as are ``velocity`` (m/s) and ``position`` (m), in the first frame.
         elapsed: s.
     """
-    none, one = jnp.zeros((3, 3), elapsed.dtype), jnp.eye(3, dtype=elapsed.dtype)
-    moved = jnp.block(
-        [[one, none, none], [-skew(position), one, elapsed * one], [-skew(velocity), none, one]]
+    back = rotation_matrix(rotation).T
+    by_position, by_velocity = -back @ skew(jnp.stack([position, velocity]))
+    return from_blocks(
+        (NAV_DOF, NAV_DOF),
+        (ROTATION, ROTATION, back),
+        (POSITION, ROTATION, by_position),
+        (POSITION, POSITION, back),
+        (POSITION, VELOCITY, elapsed * back),
+        (VELOCITY, ROTATION, by_velocity),
+        (VELOCITY, VELOCITY, back),
     )
-    return jnp.einsum("ji,bjc->bic", rotation.as_matrix(), moved.reshape(3, 3, 9)).reshape(9, 9)
 
 
 def _integrals(rotvec: Float[Array, "n 3"], turning: bool) -> tuple[Array, Array]:
@@ -151,7 +159,7 @@ def _multiply(p: Float[Array, "*b 4"], q: Float[Array, "*b 4"]) -> Float[Array, 
 
 
 def _knots(steps: Float[Array, "n *s"]) -> Float[Array, "k *s"]:
-    return jnp.concatenate([jnp.zeros_like(steps[:1]), jnp.cumsum(steps, axis=0)])
+    return jnp.concatenate([jnp.zeros_like(steps[:1]), prefix_sum(steps)])
 
 
 def _by_rotvec(rotvec: Float[Array, "n 3"], accel: Float[Array, "n 3"], turning: bool) -> tuple[Array, Array]:
@@ -161,4 +169,4 @@ def _by_rotvec(rotvec: Float[Array, "n 3"], accel: Float[Array, "n 3"], turning:
 
 
 def _force_at_end(rotvec: Float[Array, "n 3"], accel: Float[Array, "n 3"], turning: bool) -> Array:
-    return jaxlie.SO3.exp(rotvec).as_matrix() @ accel[..., None] if turning else accel[..., None]
+    return rotation_exponential(rotvec) @ accel[..., None] if turning else accel[..., None]

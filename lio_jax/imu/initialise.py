@@ -1,10 +1,12 @@
 """The first navigation state of a vehicle at rest: level, biases and their joint uncertainty."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
+from lio_jax.core.blocks import from_blocks
 from lio_jax.core.error_state import (
     ACCEL_BIAS,
     DOF,
@@ -19,8 +21,9 @@ from lio_jax.core.error_state import (
     sphere_basis,
 )
 from lio_jax.core.params import ImuParams, InitialParams
+from lio_jax.core.prefix_sum import running_count
+from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.core.types import ImuBatch, NavState, initial_nav_state
-from lio_jax.imu.rotation_integrals import skew
 
 MIN_SAMPLES = 5
 """Fewer samples cannot show that the vehicle is at rest."""
@@ -79,18 +82,16 @@ def initialise_at_rest(
     """
     present = jnp.any(imu.mask)
     count = jnp.maximum(jnp.sum(imu.mask), 1)
-    gyro, gyro_variance = _mean_and_variance(imu.gyro, imu.mask)
-    accel, accel_variance = _mean_and_variance(imu.accel, imu.mask)
+    signal = jnp.stack([imu.gyro, imu.accel])
+    (gyro, accel), scatter = _mean_and_variance(signal, imu.mask)
+    gyro_scatter, accel_scatter = jnp.mean(scatter, axis=1)
     accel = jnp.where(present, accel, jnp.array([0.0, 0.0, 1.0]) * params.gravity)
     strength = jnp.linalg.norm(accel)
     rate = _sample_rate(imu)
     gyro_noise = params.gyro_noise**2 * rate
     accel_noise = params.accel_noise**2 * rate
-    steady = _is_steady(imu.gyro, imu.mask, gyro_variance, gyro_noise, STILL_GYRO) & _is_steady(
-        imu.accel, imu.mask, accel_variance, accel_noise, STILL_ACCEL
-    )
     is_still = (
-        steady
+        _is_steady(signal, imu.mask, jnp.mean(scatter, axis=1), jnp.stack([gyro_noise, accel_noise]))
         & (count >= MIN_SAMPLES)
         & (jnp.linalg.norm(gyro) < STILL_RATE)
         & (jnp.abs(strength / params.gravity - 1) < STILL_MISFIT)
@@ -107,7 +108,6 @@ def initialise_at_rest(
     )
     prior = _prior(nav, initial, is_still)
     # the scatter of few samples may be small by chance
-    gyro_scatter, accel_scatter = jnp.mean(gyro_variance), jnp.mean(accel_variance)
     gyro_error = jnp.maximum(gyro_scatter, gyro_noise / 4) / count
     accel_error = jnp.maximum(accel_scatter, accel_noise / 4) / count
     accel_error = jnp.where(is_still, accel_error, accel_scatter + MOVING_ACCEL**2)
@@ -133,14 +133,15 @@ def levelled(up: Float[Array, "3"]) -> jaxlie.SO3:
     """Return the rotation world from imu with yaw zero for which ``up`` (imu frame) is world z."""
     roll = jnp.arctan2(up[1], up[2])
     pitch = jnp.arctan2(-up[0], jnp.hypot(up[1], up[2]))
-    return jaxlie.SO3.from_rpy_radians(roll, pitch, jnp.zeros_like(roll))
+    half = jnp.stack([roll, pitch]) / 2
+    (c_roll, c_pitch), (s_roll, s_pitch) = jnp.cos(half), jnp.sin(half)
+    return jaxlie.SO3(jnp.stack([c_pitch * c_roll, c_pitch * s_roll, s_pitch * c_roll, -s_pitch * s_roll]))
 
 
 def _prior(nav: NavState, initial: InitialParams, is_still: Bool[Array, ""]) -> Float[Array, "24 24"]:
     """Return the covariance before the samples were looked at: tilt open, heading fixed."""
     velocity = jnp.where(is_still, initial.velocity_sigma, jnp.hypot(initial.velocity_sigma, MOVING_SPEED))
-    sigma = jnp.zeros(DOF, nav.velocity.dtype)
-    for part, value in (
+    parts = (
         (VELOCITY, velocity),
         (GYRO_BIAS, initial.gyro_bias_sigma),
         (ACCEL_BIAS, initial.accel_bias_sigma),
@@ -148,12 +149,13 @@ def _prior(nav: NavState, initial: InitialParams, is_still: Bool[Array, ""]) -> 
         (EXTRINSIC_ROTATION, initial.extrinsic_rotation_sigma),
         (EXTRINSIC_TRANSLATION, initial.extrinsic_translation_sigma),
         (TIME_OFFSET, initial.time_offset_sigma),
-    ):
-        sigma = sigma.at[part].set(value)
-    up = nav.T_world_imu.rotation().inverse() @ jnp.array([0.0, 0.0, 1.0])
+    )
+    dtype = nav.velocity.dtype
+    up = rotation_matrix(nav.T_world_imu.rotation())[2]
     tilt = jnp.where(initial.rotation_sigma > 0, _UNKNOWN_TILT**2, 0.0)
-    level = tilt * (jnp.eye(3) - jnp.outer(up, up))
-    return jnp.diag(sigma**2).at[ROTATION, ROTATION].set(level)
+    level = tilt * (jnp.eye(3, dtype=dtype) - jnp.outer(up, up))
+    own = [(part, part, sigma**2 * jnp.eye(part.stop - part.start, dtype=dtype)) for part, sigma in parts]
+    return from_blocks((DOF, DOF), (ROTATION, ROTATION, level), *own)
 
 
 def _seen_at_rest(
@@ -166,48 +168,58 @@ def _seen_at_rest(
     use_gyro: Bool[Array, ""],
 ) -> tuple[Float[Array, "24"], Float[Array, "24 24"]]:
     """Return mean and covariance of the error state once the mean samples are known (a Kalman update)."""
-    back = nav.T_world_imu.rotation().inverse()
-    force = -(back @ nav.gravity)
-    H = jnp.zeros((6, DOF), prior.dtype)
-    H = H.at[:3, GYRO_BIAS].set(jnp.where(use_gyro, jnp.eye(3), 0.0))
-    H = H.at[3:, ACCEL_BIAS].set(jnp.eye(3))
-    H = H.at[3:, ROTATION].set(skew(force))
-    H = H.at[3:, GRAVITY].set(back.as_matrix() @ skew(nav.gravity) @ sphere_basis(nav.gravity))
+    back = rotation_matrix(nav.T_world_imu.rotation()).T
+    force = -back @ nav.gravity
+    identity = jnp.eye(3, dtype=prior.dtype)
+    gyro_rows, accel_rows = slice(0, 3), slice(3, 6)
+    H = from_blocks(
+        (6, DOF),
+        (gyro_rows, GYRO_BIAS, jnp.where(use_gyro, identity, 0.0)),
+        (accel_rows, ACCEL_BIAS, identity),
+        (accel_rows, ROTATION, skew(force)),
+        (accel_rows, GRAVITY, back @ skew(nav.gravity) @ sphere_basis(nav.gravity)),
+    )
     # an unused row has no variance of its own and would make the system singular
     gyro_variance = jnp.where(use_gyro, gyro_variance, 1.0)
-    R = jnp.diag(jnp.repeat(jnp.stack([gyro_variance, accel_variance]), 3))
-    gain = jnp.linalg.solve(H @ prior @ H.T + R, H @ prior).T
-    kept = jnp.eye(DOF) - gain @ H
+    R = from_blocks(
+        (6, 6),
+        (gyro_rows, gyro_rows, gyro_variance * identity),
+        (accel_rows, accel_rows, accel_variance * identity),
+    )
+    HP = H @ prior
+    factor = jnp.linalg.cholesky(HP @ H.T + R, symmetrize_input=False)
+    gain = jax.scipy.linalg.cho_solve((factor, True), HP).T
+    kept = jnp.eye(DOF, dtype=prior.dtype) - gain @ H
     covariance = kept @ prior @ kept.T + gain @ R @ gain.T
     return gain @ jnp.concatenate([gyro, accel - force]), (covariance + covariance.T) / 2
 
 
 def _mean_and_variance(
-    samples: Float[Array, "m 3"], mask: Bool[Array, " m"]
-) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Return mean and scatter per axis over the real samples; zeros where there are none."""
+    samples: Float[Array, "s m 3"], mask: Bool[Array, " m"]
+) -> tuple[Float[Array, "s 3"], Float[Array, "s 3"]]:
+    """Return mean and scatter per sensor and axis over the real samples; zeros where there are none."""
     count = jnp.sum(mask)
-    mean = jnp.sum(jnp.where(mask[:, None], samples, 0.0), axis=0) / jnp.maximum(count, 1)
-    square = jnp.sum(jnp.where(mask[:, None], (samples - mean) ** 2, 0.0), axis=0)
+    mean = jnp.sum(jnp.where(mask[:, None], samples, 0.0), axis=1) / jnp.maximum(count, 1)
+    square = jnp.sum(jnp.where(mask[:, None], (samples - mean[:, None]) ** 2, 0.0), axis=1)
     return mean, square / jnp.maximum(count - 1, 1)
 
 
 def _is_steady(
-    samples: Float[Array, "m 3"],
+    samples: Float[Array, "s m 3"],
     mask: Bool[Array, " m"],
-    variance: Float[Array, "3"],
-    noise_variance: Float[Array, ""],
-    tolerance: float,
+    variance: Float[Array, " s"],
+    noise_variance: Float[Array, " s"],
 ) -> Bool[Array, ""]:
-    """Return whether scatter and drift are those of a sensor at rest."""
-    rank = jnp.cumsum(mask)
+    """Return whether scatter and drift are those of a gyroscope and an accelerometer at rest."""
+    tolerance = jnp.array([STILL_GYRO, STILL_ACCEL], variance.dtype)
+    rank = running_count(mask)
     early, _ = _mean_and_variance(samples, mask & (rank * 2 <= rank[-1]))
     late, _ = _mean_and_variance(samples, mask & (rank * 2 > rank[-1]))
     half = jnp.maximum(rank[-1] / 2, 1.0)
     # a slow start hides in the noise of single samples but not in their mean
-    drift = jnp.linalg.norm(late - early)
-    calm = jnp.mean(variance) < tolerance**2 + 4 * noise_variance
-    return calm & (drift < tolerance + 4 * jnp.sqrt(2 * jnp.mean(variance) / half))
+    drift = jnp.linalg.norm(late - early, axis=1)
+    calm = variance < tolerance**2 + 4 * noise_variance
+    return jnp.all(calm & (drift < tolerance + 4 * jnp.sqrt(2 * variance / half)))
 
 
 def _sample_rate(imu: ImuBatch) -> Float[Array, ""]:

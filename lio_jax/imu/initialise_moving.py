@@ -24,11 +24,11 @@ from lio_jax.core.error_state import (
     Uncertain,
 )
 from lio_jax.core.params import ImuParams, InitialParams
+from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.core.types import ImuBatch, initial_nav_state
 from lio_jax.imu.gravity_alignment import Aligned, Scale, align, axes_across, gyro_bias_share
 from lio_jax.imu.initialise import levelled
 from lio_jax.imu.preintegration import Preintegrated, preintegrate_parallel
-from lio_jax.imu.rotation_integrals import skew
 from lio_jax.imu.sampling import sample_intervals
 
 GYRO_ROUNDS = 3
@@ -90,7 +90,7 @@ def initialise_moving(
     # near the last pose, for single precision
     near = jaxlie.SE3(T_world_lidar.wxyz_xyz.at[:, 4:].add(-last).astype(dtype))
     T_near_imu = jax.vmap(lambda pose: pose @ T_imu_lidar.inverse())(near)
-    matrices = T_near_imu.rotation().as_matrix()
+    matrices = rotation_matrix(T_near_imu.rotation())
 
     def integrated(gyro_bias: Float[Array, "3"]) -> Preintegrated:
         def one(samples: ImuBatch, begin: Array, finish: Array) -> Preintegrated:
@@ -174,7 +174,7 @@ def _error_covariance(
         return levelled(matrices[0].T @ up / jnp.linalg.norm(up)) @ jaxlie.SO3.from_matrix(matrices[0].T)
 
     flat = jnp.zeros(2, covariance.dtype)
-    turn = level(flat).inverse().as_matrix() @ jax.jacfwd(
+    turn = rotation_matrix(level(flat).inverse()) @ jax.jacfwd(
         lambda tilt: (level(tilt) @ level(flat).inverse()).log()
     )(flat)
     way = solved.position[-1] - solved.position[0]

@@ -1,11 +1,15 @@
 """The motion between two filter states at every instant, for deskewing."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int32
 
+from lio_jax.core.materialise import materialised
+from lio_jax.core.rotation import rotation_matrix
 from lio_jax.imu.rotation_integrals import SERIES_LIMIT, rotation_series
 
 
@@ -18,7 +22,7 @@ class Path(eqx.Module):
     time: Float[Array, " k"]
     """Not descending, s from the scan's start."""
     T_world_imu: jaxlie.SE3
-    """Pose at each knot; after :func:`relative_path` the world is another frame."""
+    """Pose at each knot."""
     velocity: Float[Array, "k 3"]
     """In world, m/s."""
     rate: Float[Array, "n 3"]
@@ -36,12 +40,12 @@ def pose_at(path: Path, time: Float[Array, " n"]) -> jaxlie.SE3:
         path: k knots; its dtype is the result's.
         time: s from the scan's start.
     """
-    piece = _piece_at(path, time)
-    zero = jnp.zeros_like(time, path.time.dtype)
-    position = _carried(piece, (zero, zero, zero), path.gravity)
-    rotation = jaxlie.SO3.from_matrix(jnp.stack(piece.rotation, axis=1).reshape(-1, 3, 3))
-    turn = jaxlie.SO3.exp(jnp.stack(piece.turn, axis=1))
-    return jaxlie.SE3.from_rotation_and_translation((rotation @ turn).normalize(), position)
+    interval = _interval_at(path.time, time)
+    delay = time.astype(path.time.dtype) - path.time[interval]
+    position = _carried(_motion(path, jaxlie.SE3.identity()), time, jnp.zeros((len(delay), 3), delay.dtype))
+    turn = jaxlie.SO3.exp(path.rate[interval] * delay[:, None])
+    rotation = (jaxlie.SO3(path.T_world_imu.wxyz_xyz[interval, :4]) @ turn).normalize()
+    return jaxlie.SE3.from_rotation_and_translation(rotation, position)
 
 
 def carry(path: Path, time: Float[Array, " n"], points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
@@ -52,23 +56,7 @@ def carry(path: Path, time: Float[Array, " n"], points: Float[Array, "n 3"]) -> 
         time: s from the scan's start.
         points: m, each in the IMU frame of its own time.
     """
-    piece = _piece_at(path, time)
-    x, y, z = points.T
-    return _carried(piece, (x, y, z), path.gravity)
-
-
-def relative_path(path: Path, T_world_ref: jaxlie.SE3) -> Path:
-    """Return the path with the frame ``ref`` in place of the world, so that float32 holds it precisely."""
-    T_ref_world = T_world_ref.inverse()
-    back = T_ref_world.rotation()
-    return Path(
-        time=path.time,
-        T_world_imu=T_ref_world @ path.T_world_imu,
-        velocity=back @ path.velocity,
-        rate=path.rate,
-        accel=path.accel,
-        gravity=back @ path.gravity,
-    )
+    return _carried(_motion(path, jaxlie.SE3.identity()), time, points)
 
 
 def deskew_along(
@@ -82,86 +70,82 @@ def deskew_along(
         points: m, lidar frame at each point's own firing time.
         time: firing time from the scan's start, s.
     """
-    last = jaxlie.SE3(path.T_world_imu.wxyz_xyz[-1])
+    last = jaxlie.SE3(path.T_world_imu.wxyz_xyz[-1]) @ T_imu_lidar
     # the last lidar frame in place of the world: the arithmetic in float32 stays near the origin
-    near = jax.tree.map(lambda x: x.astype(points.dtype), relative_path(path, last @ T_imu_lidar))
-    extrinsic = T_imu_lidar.as_matrix().astype(points.dtype)
-    return carry(near, time, points @ extrinsic[:3, :3].T + extrinsic[:3, 3])
+    near = _seen_from(last, _motion(path, T_imu_lidar))
+    return _carried(jax.tree.map(lambda x: x.astype(points.dtype), near), time, points)
 
 
 _Triple = tuple[Array, Array, Array]
 """The three components of n vectors: apart, because XLA's loops over (n, 3) compute each of them thrice."""
 
 
-class _Piece(eqx.Module):
-    """What n instants need of their interval."""
+class _Motion(eqx.Module):
+    """The path of a body that is fixed to the IMU, in vectors of one frame."""
 
-    rotation: tuple[Array, ...]
-    """IMU frame at the interval's start to world, row by row."""
-    position: _Triple
-    """At the interval's start, m, world."""
-    velocity: _Triple
-    """At the interval's start, m/s, world."""
-    turn: _Triple
-    """Turned since the interval's start, rad, IMU frame."""
-    force: _Triple
-    """Specific force, m/s^2, IMU frame."""
-    delay: Float[Array, " n"]
-    """Since the interval's start, s."""
+    time: Float[Array, " k"]
+    """Of the knots, s from the scan's start."""
+    vectors: Float[Array, "n 8 3"]
+    """Of each of the k - 1 intervals: the body's axes x, y, z at its start, the body's origin from the IMU's
+    (m), angular rate (rad/s), specific force (m/s^2), the IMU's position (m) and velocity (m/s)."""
+    gravity: Float[Array, "3"]
 
 
-def _piece_at(path: Path, time: Float[Array, " n"]) -> _Piece:
-    rotation = path.T_world_imu.rotation().as_matrix().reshape(-1, 9)
-    columns = (path.time[:, None], rotation, path.T_world_imu.translation(), path.velocity)
-    # one gather of whole rows, from a table that is written once instead of joined anew for every element
-    table = jnp.zeros((len(path.rate), 22), path.time.dtype)
-    first = 0
-    for part in (*(column[:-1] for column in columns), path.rate, path.accel):
-        table = table.at[:, first : first + part.shape[1]].set(part)
-        first += part.shape[1]
-    rows = table[jnp.sum(path.time[1:-1] <= time[:, None], axis=1)]
-    start, *values = (rows[:, i] for i in range(22))
-    delay = time.astype(start.dtype) - start
-    x, y, z = (delay * rate for rate in values[15:18])
-    return _Piece(
-        tuple(values[:9]),
-        _triple(values[9:12]),
-        _triple(values[12:15]),
-        (x, y, z),
-        _triple(values[18:]),
-        delay,
-    )
+def _motion(path: Path, T_imu_body: jaxlie.SE3) -> _Motion:
+    """Return a path in world axes."""
+    axes = jnp.swapaxes(rotation_matrix(path.T_world_imu.rotation()), 1, 2)[:-1]
+    body = jnp.concatenate([rotation_matrix(T_imu_body.rotation()).T, T_imu_body.translation()[None]])
+    held = jnp.broadcast_to(body, (len(axes), 4, 3))
+    turning = jnp.concatenate([held, path.rate[:, None], path.accel[:, None]], axis=1) @ axes
+    start = jnp.stack([path.T_world_imu.translation(), path.velocity], axis=1)[:-1]
+    return _Motion(path.time, jnp.concatenate([turning, start], axis=1), path.gravity)
 
 
-def _triple(values: list[Array]) -> _Triple:
-    x, y, z = values
-    return x, y, z
+def _seen_from(T_world_ref: jaxlie.SE3, motion: _Motion) -> _Motion:
+    """Return a motion that is given in world axes in those of the frame ``ref``, as from its origin."""
+    R_world_ref = rotation_matrix(T_world_ref.rotation())
+    moved = motion.vectors.at[:, 6].add(-T_world_ref.translation())
+    return _Motion(motion.time, moved @ R_world_ref, motion.gravity @ R_world_ref)
 
 
-def _carried(piece: _Piece, points: _Triple, gravity: Float[Array, "3"]) -> Float[Array, "n 3"]:
-    """Return the points in world, by Exp(w) p = p + a w x p + b w x (w x p) and its second integral."""
-    a, b, c, d = rotation_series(jnp.minimum(sum(x**2 for x in piece.turn), SERIES_LIMIT))
-    turned, twice = _cross_twice(piece.turn, points)
-    pushed, pushed_twice = _cross_twice(piece.turn, piece.force)
-    h = piece.delay
-    local = [
-        points[i]
-        + a * turned[i]
-        + b * twice[i]
-        + h**2 * (piece.force[i] / 2 + c * pushed[i] + d * pushed_twice[i])
-        for i in range(3)
-    ]
-    carried = jnp.zeros((len(h), 3), h.dtype)
-    for i in range(3):
-        fallen = piece.position[i] + h * (piece.velocity[i] + h / 2 * gravity[i])
-        # written column by column: stacked columns are computed anew for every element
-        carried = carried.at[:, i].set(fallen + sum(piece.rotation[3 * i + j] * local[j] for j in range(3)))
-    return carried
+def _interval_at(knots: Float[Array, " k"], time: Float[Array, " n"]) -> Int32[Array, " n"]:
+    return jnp.sum(knots[1:-1] <= time[:, None], axis=1, dtype=jnp.int32)
 
 
-def _cross_twice(w: _Triple, p: _Triple) -> tuple[_Triple, _Triple]:
-    once = _cross(w, p)
-    return once, _cross(w, once)
+def _carried(motion: _Motion, time: Float[Array, " n"], points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Return points of the body frame at their own times in the motion's frame.
+
+    For w = h rate the turned point is p + a w x p + b w x (w x p), with p and the rate in the axes that the
+    motion is given in; of the same form is the second integral of the turning specific force.
+    """
+    interval = _interval_at(motion.time, time)
+    # one gather of whole rows
+    rows = motion.vectors.reshape(-1, 24)[interval]
+    h = time.astype(rows.dtype) - motion.time[interval]
+    x_axis, y_axis, z_axis, arm, rate, force, position, velocity = (_triple(rows, 3 * i) for i in range(8))
+    x, y, z = points.T
+    p = _each(lambda i: x * x_axis[i] + y * y_axis[i] + z * z_axis[i] + arm[i])
+    w = _each(lambda i: h * rate[i])
+    series = rotation_series(jnp.minimum(sum(x**2 for x in w), SERIES_LIMIT))
+    # once, instead of once for each column
+    a, b, c, d = materialised(series)
+    turned, pushed = _cross(w, p), _cross(w, force)
+    twice, pushed_twice = _cross(w, turned), _cross(w, pushed)
+
+    def column(i: int) -> Array:
+        fallen = position[i] + h * (velocity[i] + h / 2 * motion.gravity[i])
+        driven = h**2 * (force[i] / 2 + c * pushed[i] + d * pushed_twice[i])
+        return fallen + driven + p[i] + a * turned[i] + b * twice[i]
+
+    return jnp.stack(_each(column)).T
+
+
+def _triple(rows: Array, first: int) -> _Triple:
+    return _each(lambda i: rows[:, first + i])
+
+
+def _each(component: Callable[[int], Array]) -> _Triple:
+    return component(0), component(1), component(2)
 
 
 def _cross(u: _Triple, v: _Triple) -> _Triple:

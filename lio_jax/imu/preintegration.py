@@ -90,7 +90,7 @@ def preintegrate_parallel(
     increments = accumulate(intervals.duration, rate, accel, turning, parallel=True)
     effect = sensitivity(increments, intervals.duration, rate, accel, turning)
     noise = discretise(params, intervals.duration, intervals.gap, intervals.known)
-    jacobian = -jnp.sum(jnp.concatenate([effect.rate, effect.accel], axis=2), axis=0)
+    jacobian = -jnp.sum(effect.inputs, axis=0)
     return Preintegrated(
         duration=increments.time[-1],
         rotation=jaxlie.SO3(increments.rotation.wxyz[-1]),

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from lio_jax.core.prefix_sum import prefix_sum
 from lio_jax.imu.discretise import IntervalNoise
 from lio_jax.imu.increments import NAV_DOF, Sensitivity
 
@@ -22,8 +23,8 @@ def process_noise(
     Returns:
         Order: rotation, position, velocity (right perturbation, last frame), gyro bias, accelerometer bias.
     """
-    inputs = jnp.concatenate([effect.rate, effect.accel], axis=2)
-    later = jnp.where(measured, jnp.cumsum(inputs, axis=0) - jnp.sum(inputs, axis=0), 0.0)
+    inputs = effect.inputs
+    later = jnp.where(measured, prefix_sum(inputs) - jnp.sum(inputs, axis=0), 0.0)
     unit = jnp.broadcast_to(jnp.eye(6, dtype=inputs.dtype), (len(inputs), 6, 6))
     none = jnp.zeros_like(unit)
     columns = jnp.concatenate(

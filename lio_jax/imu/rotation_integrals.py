@@ -3,16 +3,21 @@
 import math
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from lio_jax.core.rotation import skew
 
 SERIES_LIMIT = 40.0
 """Square of the angle, rad^2, up to which the power series holds to float32's precision."""
 _SERIES_BELOW = 4.0
 """Square of the angle, rad^2, up to which it holds to float64's."""
 _TERMS = 12
+_FACTORIALS = np.array([math.factorial(n) for n in range(2 * _TERMS + 5)], float)
 
 
-def rotation_coefficients(angle_squared: Float[Array, "*b"]) -> tuple[Array, ...]:
+def rotation_coefficients(angle_squared: Float[Array, "*b"]) -> Float[Array, "*b 6"]:
     """Return s_n, the sum over k of (-t^2)^k / (2k+n)!, for n from 1 to 6.
 
     The first are a = sin(t)/t, b = (1-cos(t))/t^2, c = (t-sin(t))/t^3 and d = (t^2/2-1+cos(t))/t^4.
@@ -24,19 +29,16 @@ def rotation_coefficients(angle_squared: Float[Array, "*b"]) -> tuple[Array, ...
     Args:
         angle_squared: t^2, rad^2.
     """
-    small = angle_squared < _SERIES_BELOW
-    safe = jnp.where(small, 1.0, angle_squared)
+    square = angle_squared[..., None]
+    small = square < _SERIES_BELOW
+    safe = jnp.where(small, 1.0, square)
     angle = jnp.sqrt(safe)
-    sine, versine = jnp.sin(angle), 1 - jnp.cos(angle)
-    a, b, c, d = (
-        sine / angle,
-        versine / safe,
-        (angle - sine) / (safe * angle),
-        (safe / 2 - versine) / safe**2,
-    )
-    exact = (a, b, c, d, (1 / 6 - c) / safe, (1 / 24 - d) / safe)
-    x = jnp.where(small, angle_squared, 0.0)
-    return tuple(jnp.where(small, _series(x, order), exact[order - 1]) for order in range(1, 7))
+    ab = jnp.concatenate([jnp.sin(angle) / angle, (1 - jnp.cos(angle)) / safe], -1)
+    # s_(n+2) = (1/n! - s_n) / t^2
+    cd = (jnp.array([1, 1 / 2], ab.dtype) - ab) / safe
+    ef = (jnp.array([1 / 6, 1 / 24], ab.dtype) - cd) / safe
+    exact = jnp.concatenate([ab, cd, ef], -1)
+    return jnp.where(small, _series(jnp.where(small, square, 0.0), np.arange(1, 7)), exact)
 
 
 def rotation_series(angle_squared: Float[Array, "*b"]) -> tuple[Array, Array, Array, Array]:
@@ -49,12 +51,19 @@ def rotation_series(angle_squared: Float[Array, "*b"]) -> tuple[Array, Array, Ar
     return a, b, c, d
 
 
-def _series(x: Float[Array, "*b"], order: int) -> Float[Array, "*b"]:
+def _series(x: Float[Array, "*b"], order: int | NDArray[np.intp]) -> Array:
     """Return the sum over k of (-x)^k / (2 k + order)!."""
-    total = jnp.zeros_like(x)
+    total: Array = jnp.zeros_like(x)
     for k in reversed(range(_TERMS)):
-        total = 1 / math.factorial(2 * k + order) - x * total
+        total = -x * total + np.asarray(1 / _FACTORIALS[2 * k + order], x.dtype)
     return total
+
+
+def rotation_exponential(rotvec: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
+    """Return the matrix Exp(rotvec) of a rotation vector, rad; it shares its terms with the integrals."""
+    a, b, *_ = _coefficients(rotvec)
+    cross = skew(rotvec)
+    return jnp.eye(3, dtype=rotvec.dtype) + a * cross + b * (cross @ cross)
 
 
 def rotation_integrals(rotvec: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3 3"], Float[Array, "*b 3 3"]]:
@@ -67,11 +76,10 @@ def rotation_integrals(rotvec: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3
     Args:
         rotvec: rad.
     """
-    _, b, c, d, _, _ = rotation_coefficients(jnp.sum(rotvec**2, -1))
+    _, b, c, d, _, _ = _coefficients(rotvec)
     cross = skew(rotvec)
     square = cross @ cross
     identity = jnp.eye(3, dtype=rotvec.dtype)
-    b, c, d = b[..., None, None], c[..., None, None], d[..., None, None]
     return identity + b * cross + c * square, identity / 2 + c * cross + d * square
 
 
@@ -79,9 +87,10 @@ def integral_derivatives(
     rotvec: Float[Array, "*b 3"], vector: Float[Array, "*b 3"]
 ) -> tuple[Float[Array, "*b 3 3"], Float[Array, "*b 3 3"]]:
     """Return the derivatives by ``rotvec`` of ``vector`` under both :func:`rotation_integrals`."""
-    _, b, c, d, e, f = (x[..., None, None] for x in rotation_coefficients(jnp.sum(rotvec**2, -1)))
-    once = jnp.cross(rotvec, vector)
-    twice = jnp.cross(rotvec, once)
+    _, b, c, d, e, f = _coefficients(rotvec)
+    cross = skew(rotvec)
+    once = (cross @ vector[..., None])[..., 0]
+    twice = (cross @ once[..., None])[..., 0]
     row, column = rotvec[..., None, :], vector[..., None]
     of_once = -skew(vector)
     inner = jnp.sum(rotvec * vector, -1)[..., None, None] * jnp.eye(3, dtype=rotvec.dtype)
@@ -92,10 +101,6 @@ def integral_derivatives(
     return first, second
 
 
-def skew(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
-    """Return the matrix whose product with w is ``vector`` x w."""
-    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    zero = jnp.zeros_like(x)
-    return jnp.stack(
-        [jnp.stack([zero, -z, y], -1), jnp.stack([z, zero, -x], -1), jnp.stack([-y, x, zero], -1)], -2
-    )
+def _coefficients(rotvec: Float[Array, "*b 3"]) -> list[Float[Array, "*b 1 1"]]:
+    values = rotation_coefficients(jnp.sum(rotvec**2, -1))[..., None, None]
+    return [values[..., n, :, :] for n in range(6)]

@@ -47,25 +47,25 @@ def sample_intervals(
         m + 1 intervals, those outside the span with zero duration.
     """
     dtype = time_offset.dtype
-    signal = jnp.concatenate([imu.gyro, imu.accel], axis=1).astype(dtype)
-    valid = imu.mask & jnp.isfinite(imu.time) & jnp.all(jnp.isfinite(signal), axis=1)
+    samples = jnp.concatenate([imu.time[:, None], imu.gyro, imu.accel], axis=1).astype(dtype)
+    valid = imu.mask & jnp.all(jnp.isfinite(samples), axis=1)
     order = jnp.argsort(jnp.where(valid, imu.time, jnp.inf))
-    valid = valid[order]
-    time = jnp.where(valid, imu.time[order].astype(dtype) - time_offset, end + 1)
-    signal = jnp.where(valid[:, None], signal[order], 0.0)
-    last = jnp.maximum(jnp.sum(valid) - 1, 0)
+    valid, samples = valid[order], samples[order]
+    count = jnp.sum(valid)
+    time = jnp.where(valid, samples[:, 0] - time_offset, end + 1)
+    signal = jnp.where(valid[:, None], samples[:, 1:], 0.0)
+    last = jnp.maximum(count - 1, 0)
 
-    def signal_at(instant: Float[Array, ""], before: Array) -> Float[Array, "6"]:
-        left, right = jnp.clip(before, 0, last), jnp.clip(before + 1, 0, last)
-        width = time[right] - time[left]
-        share = (instant - time[left]) / jnp.where(width > 0, width, 1.0)
-        # the last sample is held: left and right are the same there
-        return signal[left] + jnp.where(width > 0, share, 0.0) * (signal[right] - signal[left])
-
-    at_start = signal_at(start, jnp.sum(valid & (time <= start)) - 1)
-    at_end = signal_at(end, jnp.sum(valid & (time < end)) - 1)
+    ends = jnp.stack([start, end])
     # selections, not minimum and maximum: at ties their derivative would be a mixture of both branches
     early, late = time <= start, time >= end
+    before = jnp.stack([jnp.sum(valid & early), count - jnp.sum(valid & late)]) - 1
+    left, right = jnp.clip(before, 0, last), jnp.clip(before + 1, 0, last)
+    width = time[right] - time[left]
+    # the last sample is held: left and right are the same there
+    share = jnp.where(width > 0, (ends - time[left]) / jnp.where(width > 0, width, 1.0), 0.0)
+    at_start, at_end = signal[left] + share[:, None] * (signal[right] - signal[left])
+
     knots = jnp.where(early, start, jnp.where(late, end, time))
     values = jnp.where(early[:, None], at_start, jnp.where(late[:, None], at_end, signal))
     knots = jnp.concatenate([start[None], knots, end[None]])
@@ -74,8 +74,8 @@ def sample_intervals(
 
     between = jnp.concatenate([jnp.zeros(1, bool), valid[1:] & valid[:-1], jnp.zeros(1, bool)])
     gap = jnp.where(between, jnp.diff(time, prepend=start, append=end), duration)
-    near = (time > start - LONGEST_GAP) | (jnp.max(jnp.where(valid, time, -jnp.inf)) >= end)
-    near &= (time < end + LONGEST_GAP) | (jnp.min(jnp.where(valid, time, jnp.inf)) <= start)
+    near = (time > start - LONGEST_GAP) | (time[last] >= end)
+    near &= (time < end + LONGEST_GAP) | (time[0] <= start)
     any_near = jnp.any(valid & near)
     mean = jnp.where(any_near, (values[1:] + values[:-1]) / 2, 0.0)
     return Intervals(duration, mean[:, :3], mean[:, 3:], gap, (gap <= LONGEST_GAP) & any_near, any_near)

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
+from lio_jax.core.blocks import from_blocks
 from lio_jax.core.error_state import (
-    ACCEL_BIAS,
+    BIASES,
     DOF,
     GRAVITY,
-    GYRO_BIAS,
     POSITION,
     TIME_OFFSET,
     VELOCITY,
@@ -19,12 +19,12 @@ from lio_jax.core.error_state import (
     sphere_basis,
 )
 from lio_jax.core.params import ImuParams
+from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.core.types import ImuBatch, NavState
 from lio_jax.imu.discretise import discretise
 from lio_jax.imu.increments import NAV_DOF, Increments, Sensitivity, accumulate, nav_transition, sensitivity
 from lio_jax.imu.path import Path
 from lio_jax.imu.process_noise import process_noise
-from lio_jax.imu.rotation_integrals import skew
 from lio_jax.imu.sampling import Intervals, sample_intervals
 
 
@@ -52,14 +52,17 @@ def propagate(
         The state at ``end``, and the motion in between.
     """
     nav = state.nav
-    intervals = sample_intervals(imu, nav.time_offset, start, end)
+    intervals, shift = jax.jvp(
+        lambda offset: sample_intervals(imu, offset, start, end),
+        (nav.time_offset,),
+        (jnp.ones_like(nav.time_offset),),
+    )
     increments, path = _follow(nav, intervals, start)
     last = jaxlie.SE3(path.T_world_imu.wxyz_xyz[-1])
     moved = dataclasses.replace(nav, T_world_imu=last, velocity=path.velocity[-1])
 
     effect = sensitivity(increments, intervals.duration, path.rate, path.accel)
-    by_offset = _effect_of_time_offset(nav, imu, start, end, effect)
-    transition = _transition(nav, increments, effect, by_offset, path.gravity, intervals.measured)
+    transition = _transition(nav, increments, effect, shift, path.gravity, intervals.measured)
     noise = discretise(params, intervals.duration, intervals.gap, intervals.known)
     added = process_noise(effect, noise, intervals.measured)
     covariance = _carry_covariance(state.covariance, transition).at[:15, :15].add(added)
@@ -79,7 +82,7 @@ def _follow(nav: NavState, intervals: Intervals, start: Float[Array, ""]) -> tup
     gravity = jnp.where(measured, nav.gravity, 0.0)
     increments = accumulate(intervals.duration, rate, accel)
     rotation = nav.T_world_imu.rotation()
-    matrix = rotation.as_matrix()
+    matrix = rotation_matrix(rotation)
     elapsed = increments.time[:, None]
     fall = elapsed * (nav.velocity + elapsed / 2 * gravity)
     position = nav.T_world_imu.translation() + fall + increments.position @ matrix.T
@@ -95,43 +98,33 @@ def _follow(nav: NavState, intervals: Intervals, start: Float[Array, ""]) -> tup
     return increments, path
 
 
-def _effect_of_time_offset(
-    nav: NavState, imu: ImuBatch, start: Float[Array, ""], end: Float[Array, ""], effect: Sensitivity
-) -> Float[Array, "9"]:
-    """Return the derivative of the last increments by the time offset, which shifts what is sampled."""
-
-    def sampled(offset: Float[Array, ""]) -> tuple[Array, Array, Array]:
-        intervals = sample_intervals(imu, offset, start, end)
-        return intervals.gyro, intervals.accel, intervals.duration
-
-    _, (gyro, accel, duration) = jax.jvp(sampled, (nav.time_offset,), (jnp.ones_like(nav.time_offset),))
-    return (
-        jnp.einsum("nij,nj->i", effect.rate, gyro)
-        + jnp.einsum("nij,nj->i", effect.accel, accel)
-        + jnp.einsum("ni,n->i", effect.duration, duration)
-    )
-
-
 def _transition(
     nav: NavState,
     increments: Increments,
     effect: Sensitivity,
-    by_offset: Float[Array, "9"],
+    shift: Intervals,
     gravity: Float[Array, "3"],
     measured: Array,
 ) -> Float[Array, "9 24"]:
-    """Return the derivative of rotation, position and velocity at the end by the whole error at the start."""
+    """Return the derivative of rotation, position and velocity at the end by the whole error at the start.
+
+    The time offset acts through ``shift``, its effect on what is sampled.
+    """
     elapsed = increments.time[-1]
     turned = jaxlie.SO3(increments.rotation.wxyz[-1])
     last = nav.T_world_imu.rotation() @ turned
-    fall = last.as_matrix().T @ -skew(gravity) @ sphere_basis(nav.gravity)
-    own = nav_transition(turned, increments.velocity[-1], increments.position[-1], elapsed)
-    transition = jnp.zeros((NAV_DOF, DOF), elapsed.dtype).at[:, :NAV_DOF].set(own)
-    transition = transition.at[POSITION, GRAVITY].set(fall * elapsed**2 / 2)
-    transition = transition.at[VELOCITY, GRAVITY].set(fall * elapsed)
-    transition = transition.at[:, GYRO_BIAS].set(jnp.where(measured, -jnp.sum(effect.rate, 0), 0.0))
-    transition = transition.at[:, ACCEL_BIAS].set(jnp.where(measured, -jnp.sum(effect.accel, 0), 0.0))
-    return transition.at[:, TIME_OFFSET].set(by_offset[:, None])
+    fall = rotation_matrix(last).T @ -skew(gravity) @ sphere_basis(nav.gravity)
+    signal = jnp.concatenate([shift.gyro, shift.accel], axis=1)
+    by_offset = jnp.einsum("nij,nj->i", effect.inputs, signal) + shift.duration @ effect.duration
+    every = slice(0, NAV_DOF)
+    return from_blocks(
+        (NAV_DOF, DOF),
+        (every, every, nav_transition(turned, increments.velocity[-1], increments.position[-1], elapsed)),
+        (every, BIASES, jnp.where(measured, -jnp.sum(effect.inputs, 0), 0.0)),
+        (POSITION, GRAVITY, fall * elapsed**2 / 2),
+        (VELOCITY, GRAVITY, fall * elapsed),
+        (every, TIME_OFFSET, by_offset[:, None]),
+    )
 
 
 def _carry_covariance(

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.hashing import voxel_hash
+from lio_jax.core.prefix_sum import running_count
 
 
 class Selection(eqx.Module):
@@ -38,7 +39,7 @@ def select_per_voxel(
     ticket = _scramble(jnp.arange(points.shape[0], dtype=jnp.uint32)).astype(jnp.int32)
     winner = jnp.full(table_size, -1, jnp.int32).at[slot].max(ticket, mode="drop")
     occupied = winner >= 0
-    rank = jnp.cumsum(occupied.astype(jnp.int32)) - 1
+    rank = running_count(occupied) - 1
     target = jnp.where(occupied, rank, capacity)
     chosen = jnp.full(capacity, -1, jnp.int32).at[target].set(winner, mode="drop")
     found = rank[-1] + 1

@@ -6,6 +6,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.hashing import voxel_hash
 from lio_jax.core.materialise import materialised
+from lio_jax.core.prefix_sum import running_count
 
 
 class MeanPoints(eqx.Module):
@@ -37,7 +38,7 @@ def mean_per_voxel(
     slot = jnp.where(mask, voxel_hash(voxel) & jnp.uint32(table_size - 1), table_size).astype(jnp.int32)
     order = jnp.arange(points.shape[0], dtype=jnp.int32)
     last = jnp.full(table_size, -1, jnp.int32).at[slot].max(order, mode="drop")
-    rank = jnp.cumsum((last >= 0).astype(jnp.int32)) - 1
+    rank = running_count(last >= 0) - 1
     row, winner = (table.at[slot].get(mode="clip") for table in (rank, last))
     x, y, z = (voxel[:, axis] == voxel[jnp.maximum(winner, 0), axis] for axis in range(3))
     row = materialised(jnp.where(mask & x & y & z & (row < capacity), row, capacity))

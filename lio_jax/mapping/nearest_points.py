@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.materialise import materialised
+from lio_jax.core.prefix_sum import running_count
 from lio_jax.mapping.hash_slots import find_slots
 from lio_jax.mapping.point_map import EDGE, VOXELS, PointMap
 
@@ -69,7 +70,7 @@ def nearest_points(
     # along each axis the eight blocks end with the query's own block on one side, one later on the other
     sure = edge * jnp.min(jnp.maximum(fraction, 1 - fraction), axis=-1)
     unsure = mask & (found.squared_distance[-1] > sure**2)
-    rank = jnp.cumsum(unsure.astype(jnp.int32)) - 1
+    rank = running_count(unsure) - 1
     waiting = jnp.full(count, count, jnp.int32).at[jnp.where(unsure, rank, count)].set(order, mode="drop")
     return search.over(found, waiting, rank[-1] + 1, jnp.array(_AROUND, jnp.int32), _WIDE_CHUNK)
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int32, UInt32
 from lio_jax.core.geometry import eigenvalues_and_normal3
 from lio_jax.core.hashing import voxel_hash
 from lio_jax.core.materialise import materialised
+from lio_jax.core.prefix_sum import running_count
 
 WAYS = 2
 """Slots a voxel may lie in: neighbours in memory, so that both are read together."""
@@ -154,7 +155,7 @@ def insert(
     voxel, cell, _ = grid.places(points)
     slot = materialised(find_slots(vmap, voxel))
     new = mask & ~((slot >= 0) & _held(vmap, slot, cell))
-    rank = jnp.cumsum(new.astype(jnp.int32)) - 1
+    rank = running_count(new) - 1
     batch = min(_BATCH, count)
     waiting = jnp.full(-(-count // batch) * batch, count, jnp.int32)
     waiting = waiting.at[jnp.where(new, rank, waiting.shape[0])].set(

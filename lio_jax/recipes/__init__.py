@@ -6,8 +6,8 @@ from lio_jax.core.errors import UsageError
 from lio_jax.recipes import default, fast_lio2
 
 RECIPES: dict[str, ModuleType] = {"default": default, "fast_lio2": fast_lio2}
-"""By name; each module has State, Output, init(config, params), step(config, params, state, scan, imu) and
-restart(config, params, state)."""
+"""By name; each module has State, Output, init(config, params, imu), step(config, params, state, scan, imu),
+restart(config, params, state, imu) and moving_as(fresh, found), what a restart adds to init."""
 
 
 def recipe_named(name: str) -> ModuleType:

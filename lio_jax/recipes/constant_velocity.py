@@ -21,16 +21,9 @@ _WEIGHTLESS = 1e-9
 """Share of gravity that is left: none at all would have no direction."""
 
 
-def unlevelled_start(params: Params, velocity: Float[Array, "3"] | None) -> Uncertain:
-    """Return the state at the world's origin, with its first pose as the world's axes and any velocity.
-
-    Args:
-        params: traced.
-        velocity: in world, m/s, where it is known; None: zero.
-    """
+def unlevelled_start(params: Params) -> Uncertain:
+    """Return the state at the world's origin, with its first pose as the world's axes and any velocity."""
     nav = initial_nav_state(params.extrinsics.T_imu_lidar())
-    if velocity is not None:
-        nav = dataclasses.replace(nav, velocity=velocity)
     # nothing tells biases, gravity or the extrinsic from the motion: they stay as they are
     sigma = jnp.zeros(DOF, nav.velocity.dtype).at[VELOCITY].set(MOVING_SPEED)
     return Uncertain(nav, jnp.diag(sigma**2))

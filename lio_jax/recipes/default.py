@@ -1,5 +1,9 @@
 """The default recipe: tightly coupled with inertial data, LiDAR odometry where there is none."""
 
+from typing import Any
+
+import equinox as eqx
+
 from lio_jax.core.config import Config
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, Scan
@@ -27,10 +31,16 @@ def restart(config: Config, params: Params, state: State, imu: ImuBatch | None =
 
     A vehicle that is already moving distorts its first scan, which nothing can compensate until the second.
     """
-    if isinstance(state, lidar_odometry.State):
-        return lidar_odometry.init(config, params, state.twist)
-    assert imu is not None
-    return lidar_inertial.init(config, params, imu, state.uncertain.nav.velocity)
+    return moving_as(init(config, params, imu), state)
+
+
+def moving_as(fresh: State, found: State) -> State:
+    """Return the state before the first scan with the velocity of another: a mere exchange of leaves."""
+    return eqx.tree_at(_velocity, fresh, _velocity(found))
+
+
+def _velocity(state: State) -> Any:
+    return state.twist if isinstance(state, lidar_odometry.State) else state.uncertain.nav.velocity
 
 
 def step(

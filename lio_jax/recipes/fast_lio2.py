@@ -7,6 +7,8 @@ Xu, Cai, He, Lin & Zhang, "FAST-LIO2: Fast direct LiDAR-inertial odometry", T-RO
 ``recipe_settings("fast_lio2")``. Without inertial samples the velocity is taken as constant.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -69,8 +71,9 @@ def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
         params: traced.
         imu: samples of about a second up to the first scan's end; None: there are no inertial data.
     """
-    start = unlevelled_start(params, None) if imu is None else levelled_start(params, imu, None)
-    return _before_the_first(config, start, jnp.zeros_like(start.nav.velocity))
+    start = unlevelled_start(params) if imu is None else levelled_start(params, imu)
+    none = jnp.zeros_like(start.nav.velocity)
+    return State(start.nav, start, none, none[0], jnp.int32(0), empty_map(config.map.capacity))
 
 
 def restart(config: Config, params: Params, state: State, imu: ImuBatch | None = None) -> State:
@@ -78,14 +81,16 @@ def restart(config: Config, params: Params, state: State, imu: ImuBatch | None =
 
     A vehicle that is already moving distorts its first scan, which nothing can compensate until the second.
     """
-    velocity = state.nav.velocity
-    start = unlevelled_start(params, velocity) if imu is None else levelled_start(params, imu, velocity)
-    return _before_the_first(config, start, state.rate)
+    return moving_as(init(config, params, imu), state)
 
 
-def _before_the_first(config: Config, start: Uncertain, rate: Float[Array, "3"]) -> State:
-    to_end = jnp.zeros_like(rate[0])
-    return State(start.nav, start, rate, to_end, jnp.int32(0), empty_map(config.map.capacity))
+def moving_as(fresh: State, found: State) -> State:
+    """Return the state before the first scan with the motion of another: a mere exchange of leaves."""
+    return eqx.tree_at(_motion, fresh, _motion(found))
+
+
+def _motion(state: State) -> Any:
+    return state.nav.velocity, state.uncertain.nav.velocity, state.rate
 
 
 def step(

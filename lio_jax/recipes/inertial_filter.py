@@ -1,13 +1,12 @@
 """What the recipes with an error-state filter share: the start, the prediction and the form of the result."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
+from lio_jax.core.blocks import from_blocks
 from lio_jax.core.error_state import (
     DOF,
     EXTRINSIC_ROTATION,
@@ -19,25 +18,24 @@ from lio_jax.core.error_state import (
     sphere_basis,
 )
 from lio_jax.core.params import Params
+from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import Update
 from lio_jax.estimation.pose_measurement import lidar_pose_jacobian
 from lio_jax.imu.initialise import initialise_at_rest
 from lio_jax.imu.path import Path
-from lio_jax.imu.rotation_integrals import skew
 from lio_jax.imu.strapdown import propagate
 from lio_jax.recipes.output import Evidence
 from lio_jax.registration.point_evidence import PointEvidence
 from lio_jax.registration.scan_to_map import NormalEquations, Registration
 
 
-def levelled_start(params: Params, imu: ImuBatch, velocity: Float[Array, "3"] | None) -> Uncertain:
-    """Return the state at the world's origin, levelled by the samples.
+def levelled_start(params: Params, imu: ImuBatch) -> Uncertain:
+    """Return the state at the world's origin, levelled by the samples, as if the vehicle were at rest.
 
     Args:
         params: traced.
         imu: samples of about a second up to the first scan's end.
-        velocity: in world, m/s, where it is known; None: that of a vehicle at rest.
     """
     start = initialise_at_rest(
         imu,
@@ -46,8 +44,7 @@ def levelled_start(params: Params, imu: ImuBatch, velocity: Float[Array, "3"] | 
         params.extrinsics.T_imu_lidar(),
         params.extrinsics.time_offset,
     )
-    nav = start.start.nav if velocity is None else dataclasses.replace(start.start.nav, velocity=velocity)
-    return held_at_lidar(Uncertain(nav, start.start.covariance))
+    return held_at_lidar(start.start)
 
 
 def held_at_lidar(state: Uncertain) -> Uncertain:
@@ -58,13 +55,16 @@ def held_at_lidar(state: Uncertain) -> Uncertain:
     error f, d of the extrinsic.
     """
     nav = state.nav
-    R_world_imu = nav.T_world_imu.rotation().as_matrix()
-    turn = -nav.T_imu_lidar.rotation().as_matrix()
-    carried = jnp.eye(DOF, dtype=state.covariance.dtype)
-    carried = carried.at[ROTATION, EXTRINSIC_ROTATION].set(turn)
-    carried = carried.at[POSITION, EXTRINSIC_TRANSLATION].set(-jnp.eye(3))
-    carried = carried.at[POSITION, EXTRINSIC_ROTATION].set(skew(nav.T_imu_lidar.translation()) @ turn)
-    carried = carried.at[GRAVITY, EXTRINSIC_ROTATION].set(sphere_basis(nav.gravity).T @ R_world_imu @ turn)
+    R_world_imu = rotation_matrix(nav.T_world_imu.rotation())
+    turn = -rotation_matrix(nav.T_imu_lidar.rotation())
+    carried = from_blocks(
+        (DOF, DOF),
+        (slice(0, DOF), slice(0, DOF), jnp.eye(DOF, dtype=turn.dtype)),
+        (ROTATION, EXTRINSIC_ROTATION, turn),
+        (POSITION, EXTRINSIC_TRANSLATION, -jnp.eye(3, dtype=turn.dtype)),
+        (POSITION, EXTRINSIC_ROTATION, skew(nav.T_imu_lidar.translation()) @ turn),
+        (GRAVITY, EXTRINSIC_ROTATION, sphere_basis(nav.gravity).T @ R_world_imu @ turn),
+    )
     covariance = carried @ state.covariance @ carried.T
     return Uncertain(nav, (covariance + covariance.T) / 2)
 
@@ -101,7 +101,7 @@ class Linearised(eqx.Module):
 def registration_of(update: Update, last: Linearised, T_world_lidar: jaxlie.SE3) -> Registration:
     """Return the update in the terms of a scan-to-map solve."""
     equations = last.equations
-    to_body = jax.scipy.linalg.block_diag(*[T_world_lidar.rotation().as_matrix()] * 2)
+    to_body = jax.scipy.linalg.block_diag(*[rotation_matrix(T_world_lidar.rotation())] * 2)
     return Registration(
         T_world_lidar=T_world_lidar,
         information=to_body.T @ update.measurement.information @ to_body,

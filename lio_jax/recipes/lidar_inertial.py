@@ -52,16 +52,15 @@ class State(eqx.Module):
         return self.uncertain.nav
 
 
-def init(config: Config, params: Params, imu: ImuBatch, velocity: Float[Array, "3"] | None = None) -> State:
+def init(config: Config, params: Params, imu: ImuBatch) -> State:
     """Return the state before the first scan: at the world's origin, levelled by the samples.
 
     Args:
         config: static.
         params: traced.
         imu: samples of about a second up to the first scan's end.
-        velocity: in world, m/s, where it is known; None: that of a vehicle at rest.
     """
-    uncertain = levelled_start(params, imu, velocity)
+    uncertain = levelled_start(params, imu)
     return State(
         uncertain=uncertain,
         prediction_error=jnp.asarray(params.motion.initial_error, uncertain.covariance.dtype),

@@ -37,13 +37,12 @@ class State(eqx.Module):
     map: VoxelMap
 
 
-def init(config: Config, params: Params, twist: Float[Array, "6"] | None = None) -> State:
+def init(config: Config, params: Params) -> State:
     """Return the state before the first scan: at the world's origin, with an empty map.
 
     Args:
         config: static.
         params: traced.
-        twist: velocity of the lidar in its own frame, m/s then rad/s; None: at rest.
     """
     nav = initial_nav_state(params.extrinsics.T_imu_lidar())
     dtype = nav.velocity.dtype
@@ -51,19 +50,11 @@ def init(config: Config, params: Params, twist: Float[Array, "6"] | None = None)
         nav=nav,
         T_world_lidar=nav.T_world_imu @ nav.T_imu_lidar,
         mid_to_end=jnp.zeros((), dtype),
-        twist=jnp.zeros(6, dtype) if twist is None else twist,
+        twist=jnp.zeros(6, dtype),
         prediction_error=jnp.asarray(params.motion.initial_error, dtype),
         scans=jnp.int32(0),
         map=empty_map(config.map.capacity),
     )
-
-
-def restart(config: Config, params: Params, state: State) -> State:
-    """Return the state before the first scan once more, now with the velocity that ``state`` found.
-
-    A vehicle that is already moving distorts its first scan, which nothing can compensate until the second.
-    """
-    return init(config, params, state.twist)
 
 
 def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[State, Output]:

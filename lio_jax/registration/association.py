@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
+from lio_jax.core.rotation import rotation_matrix
+
 _Found = TypeVar("_Found")
 """What the points were associated with, as a pytree of arrays."""
 
@@ -48,7 +50,7 @@ def associated(
         T_world_lidar: where the scan is now.
         distance: how far its points may have moved since ``last``, m.
     """
-    turn = T_world_lidar.rotation().as_matrix() - last.T_world_lidar.rotation().as_matrix()
+    turn = rotation_matrix(T_world_lidar.rotation()) - rotation_matrix(last.T_world_lidar.rotation())
     move = T_world_lidar.translation() - last.T_world_lidar.translation()
     # |R - R'| = sqrt(2) |angle| for small angles, in Frobenius' norm
     moved = jnp.linalg.norm(move) + last.arm * jnp.linalg.norm(turn) / jnp.sqrt(2.0)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.implicit import Problem, Solution, implicit
 from lio_jax.core.params import Params
+from lio_jax.core.rotation import rotation_matrix
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, query_nearest
 from lio_jax.registration.association import Association, associated, no_association
 
@@ -73,7 +74,7 @@ class Frame(eqx.Module):
         self, points: Float[Array, "k 3"], T_world_lidar: jaxlie.SE3
     ) -> tuple[Float[Array, "k 3"], Float[Array, "k 3"]]:
         """Return points of the lidar frame in world axes, from the sensor and from the origin, m."""
-        arm = points @ T_world_lidar.rotation().as_matrix().astype(points.dtype).T
+        arm = points @ rotation_matrix(T_world_lidar.rotation()).astype(points.dtype).T
         return arm, arm + (T_world_lidar.translation() - self.origin).astype(points.dtype)
 
 
@@ -255,7 +256,7 @@ def register(
     settings = params.registration
     lost = (equations.matches < settings.min_matches) | ~jnp.all(jnp.isfinite(T.wxyz_xyz))
     T = jaxlie.SE3(jnp.where(lost, T_world_lidar.wxyz_xyz, T.wxyz_xyz))
-    to_body = jax.scipy.linalg.block_diag(*[T.rotation().as_matrix()] * 2)
+    to_body = jax.scipy.linalg.block_diag(*[rotation_matrix(T.rotation())] * 2)
     return Registration(
         T_world_lidar=T,
         information=jnp.where(lost, 0.0, to_body.T @ equations.hessian @ to_body),

@@ -48,12 +48,11 @@ class CompiledStep:
     """A recipe's step, compiled once per scan size, with the compile time kept apart from the run time."""
 
     def __init__(self, settings: Settings) -> None:
-        recipe = recipe_named(settings.recipe)
+        self._recipe = recipe = recipe_named(settings.recipe)
         self.config: Config = settings.config
         self.params: Params = settings.params()
         self.compile_s = 0.0
         self._init = jax.jit(partial(recipe.init, self.config))
-        self._restart = jax.jit(partial(recipe.restart, self.config))
         self._step = jax.jit(partial(recipe.step, self.config), donate_argnums=1)
         self._programs: dict[Any, Any] = {}
 
@@ -63,7 +62,8 @@ class CompiledStep:
 
     def restarted(self, state: Any, imu: Any) -> Any:
         """Return the state before the first scan, with the velocity that ``state`` found."""
-        return self._run("restart", self._restart, self.params, state, imu)
+        # no program of its own, which takes as long to compile as the first
+        return self._recipe.moving_as(self.initial_state(imu), state)
 
     def __call__(self, state: Any, scan: Any, imu: Any) -> tuple[Any, Any]:
         """Run one step; ``state`` is consumed."""

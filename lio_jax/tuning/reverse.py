@@ -75,8 +75,9 @@ class CheckpointedGradient:
             def smooth_part(x: Array, smooth: Any, sums: Any) -> tuple[Any, Any]:
                 old = None if state is None else eqx.combine(smooth, fixed)
                 new, seen = forward(kind, x, old, scan, imu)
-                counted = seen is not None and truth is not None
-                return parted(new)[0], objective.add(sums, seen, truth) if counted else sums
+                if seen is not None and truth is not None:
+                    sums = objective.add(sums, seen, truth)
+                return parted(new)[0], sums
 
             _, pull = jax.vjp(smooth_part, x, smooth, sums)
             return pull(cotangent)

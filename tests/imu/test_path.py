@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from lio_jax.imu.path import Path, carry, deskew_along, pose_at, relative_path
+from lio_jax.imu.path import Path, carry, deskew_along, pose_at
 from lio_jax.imu.strapdown import path_along
 from tests.imu.motion import ideal_imu, nav_at, pose_matrix, quick_jit
 
@@ -124,13 +124,6 @@ def test_deskewed_points_stand_still(path: Path, kilometres: float) -> None:
     assert got.dtype == jnp.float32
     assert np.abs(points - expected).max() > 1
     np.testing.assert_allclose(got, expected, atol=1e-3)
-
-
-def test_relative_path_moves_the_world(path: Path) -> None:
-    reference = jaxlie.SE3.exp(jnp.array([1.0, 2.0, 3.0, 0.3, -0.5, 0.2]))
-    times = jnp.linspace(0, END, 7)
-    expected = np.asarray(reference.inverse().as_matrix()) @ np.asarray(poses(path, times))
-    np.testing.assert_allclose(poses(relative_path(path, reference), times), expected, atol=1e-12)
 
 
 @pytest.fixture(scope="module")

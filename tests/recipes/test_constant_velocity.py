@@ -50,8 +50,8 @@ def moved(seconds: float) -> np.ndarray:
 
 def start() -> Uncertain:
     """A state that is known exactly."""
-    begun = unlevelled_start(PARAMS, POSE.rotation() @ jnp.asarray(SPEED))
-    nav = dataclasses.replace(begun.nav, T_world_imu=POSE)
+    begun = unlevelled_start(PARAMS)
+    nav = dataclasses.replace(begun.nav, T_world_imu=POSE, velocity=POSE.rotation() @ jnp.asarray(SPEED))
     return Uncertain(nav, jnp.zeros_like(begun.covariance))
 
 

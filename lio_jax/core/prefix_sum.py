@@ -1,0 +1,29 @@
+"""Prefix sums as products with triangular matrices: faster than XLA's windowed sums on a CPU."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int32
+
+_BLOCK = 32
+_ONE_PRODUCT = 64
+"""So few rows are summed by a single product."""
+
+
+def prefix_sum(values: Float[Array, "n *s"]) -> Float[Array, "n *s"]:
+    """Return the sum of the rows, of which there is at least one, up to each one, itself included."""
+    count, *shape = values.shape
+    block = count if count <= _ONE_PRODUCT else _BLOCK
+    padding = ((0, -count % block), *((0, 0) for _ in shape))
+    rows = jnp.pad(values, padding).reshape(-1, block, *shape)
+    lower = np.tri(block, dtype=values.dtype)
+    sums = jnp.einsum("ij,bj...->bi...", lower, rows, precision=jax.lax.Precision.HIGHEST)
+    if len(rows) > 1:
+        total = sums[:, -1]
+        sums = sums + (prefix_sum(total) - total)[:, None]
+    return sums.reshape(-1, *shape)[:count]
+
+
+def running_count(mask: Bool[Array, " n"]) -> Int32[Array, " n"]:
+    """Return how many rows are true up to each one, itself included; exact below 2^24 rows."""
+    return prefix_sum(mask.astype(jnp.float32)).astype(jnp.int32)
