@@ -103,14 +103,6 @@ class _TangentSteps:
 
             return _moving(pushed(start, (x,), (jnp.eye(len(x), dtype=x.dtype),)))
 
-        def restart(x: Array, moving: _Moving, imu: ImuBatch | None) -> _Moving:
-            smooth, fixed = parted(moving.state)
-
-            def start(x: Array, smooth: Any) -> tuple[Any, Any]:
-                return parted(module.restart(config, free(x), eqx.combine(smooth, fixed), imu))
-
-            return _moving(pushed(start, (x, smooth), (jnp.eye(len(x), dtype=x.dtype), moving.dot)))
-
         def step(x: Array, moving: _Moving, scan: Scan, imu: ImuBatch | None) -> tuple[_Moving, Any]:
             smooth, fixed = parted(moving.state)
 
@@ -126,7 +118,7 @@ class _TangentSteps:
             return _Moving(eqx.combine(smooth, rest), dot), (eqx.combine(seen, unseen), seen_dot)
 
         self.init = jax.jit(first)
-        self.restart = jax.jit(restart)
+        self.recipe = module
         self.step = jax.jit(step, donate_argnums=1)
 
     def at(self, x: Array) -> "_StepAt":
@@ -144,7 +136,8 @@ class _StepAt:
         return self._programs.init(self._x, imu)
 
     def restarted(self, state: _Moving, imu: ImuBatch | None) -> _Moving:
-        return self._programs.restart(self._x, state, imu)
+        fresh, exchanged = self.initial_state(imu), self._programs.recipe.moving_as
+        return _Moving(exchanged(fresh.state, state.state), exchanged(fresh.dot, state.dot))
 
     def __call__(self, state: _Moving, scan: Scan, imu: ImuBatch | None) -> tuple[_Moving, Any]:
         return self._programs.step(self._x, state, scan, imu)

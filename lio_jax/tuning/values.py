@@ -28,11 +28,9 @@ class StreamingValues:
             state, output = module.step(config, free(x), state, scan, imu)
             return state, Observed.of(state, output)
 
-        self._init = jax.jit(jax.vmap(lambda x, imu: module.init(config, free(x), imu), (0, None)))
-        self._restart = jax.jit(
-            jax.vmap(lambda x, state, imu: module.restart(config, free(x), state, imu), (0, 0, None))
-        )
-        self._step = jax.jit(jax.vmap(one, (0, 0, None, None)), donate_argnums=1)
+        self.init = jax.jit(jax.vmap(lambda x, imu: module.init(config, free(x), imu), (0, None)))
+        self.exchanged = module.moving_as
+        self.step = jax.jit(jax.vmap(one, (0, 0, None, None)), donate_argnums=1)
         self._add = jax.jit(jax.vmap(objective.add, (0, 0, None)))
         self._value = jax.jit(jax.vmap(objective.value))
 
@@ -51,9 +49,12 @@ class _Batch:
     """A :class:`lio_jax.run.track.Step` over a batch of states."""
 
     def __init__(self, programs: StreamingValues, x: Any) -> None:
-        self.initial_state = partial(programs._init, x)
-        self.restarted = partial(programs._restart, x)
-        self._step = partial(programs._step, x)
+        self.initial_state = partial(programs.init, x)
+        self._exchanged = programs.exchanged
+        self._step = partial(programs.step, x)
+
+    def restarted(self, state: Any, imu: Any) -> Any:
+        return self._exchanged(self.initial_state(imu), state)
 
     def __call__(self, state: Any, scan: Any, imu: Any) -> tuple[Any, Any]:
         return self._step(state, scan, imu)
