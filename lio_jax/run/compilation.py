@@ -2,7 +2,7 @@
 
 import jax
 
-_CPU_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+_CPU_OPTIONS: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False}
 """XLA's newer emitters of kernels take twice as long, for a step that is no faster."""
 
 
