@@ -16,7 +16,7 @@ from lio_jax.data.trajectory import Trajectory
 from lio_jax.recipes import recipe_named
 from lio_jax.run.folder import run_folder, write_json
 from lio_jax.run.run import Observer, RunResult, check_start, run_sequence, settings_for
-from lio_jax.run.track import Tracked
+from lio_jax.run.track import Tracked, pose_matrix
 from lio_jax.viz.recording import Recording
 
 
@@ -129,7 +129,7 @@ class RecordingObserver:
     def __call__(self, tracked: Tracked, scan_ms: float) -> None:
         """Log the motion-compensated scan at its pose."""
         output, registration = tracked.output, tracked.output.registration
-        T_world_lidar = tracked.T_world_imu @ np.asarray(tracked.nav.T_imu_lidar.as_matrix())
+        T_world_lidar = tracked.T_world_imu @ pose_matrix(tracked.nav.T_imu_lidar.wxyz_xyz)
         points = np.asarray(output.points)
         kept = slice(None, None, max(1, len(points) // _RECORDED_POINTS))
         points = points[kept][np.asarray(output.points_mask)[kept]]

@@ -4,9 +4,9 @@ LIO-SAM's IMU odometry and TransformFusion in one: the corrected states are the 
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.types import ImuBatch, NavState
-from lio_jax.imu.path import pose_at
 from lio_jax.imu.strapdown import path_along
 
 _SMALLEST_BATCH = 32
@@ -28,7 +27,8 @@ def poses_at_samples(
 
     Args:
         nav: at ``start``, just corrected.
-        imu: from the last sample before ``start`` to the first one after ``end``.
+        imu: from the last sample before ``start`` to the first one after ``end``; in ascending order, padding
+            last, all values finite.
         start: s, same origin as the samples' times.
         end: when the next correction arrives, s.
 
@@ -39,7 +39,8 @@ def poses_at_samples(
     path = path_along(nav, imu, start, end)
     time = imu.time.astype(path.time.dtype) - nav.time_offset
     inside = imu.mask & (time > start) & (time <= end)
-    return pose_at(path, jnp.where(inside, time, jnp.where(time > end, end, start))), inside
+    # the path's knots are the samples, between its two ends
+    return jaxlie.SE3(path.T_world_imu.wxyz_xyz[1:-1]), inside
 
 
 _poses_at_samples = jax.jit(poses_at_samples)
@@ -79,9 +80,8 @@ def imu_rate_trajectory(
         first, last = np.searchsorted(imu_stamps_ns, [begin + offset, end + offset], side="right")
         chosen = slice(max(first - 1, 0), min(last + 1, len(imu_stamps_ns)))
         batch = _padded(imu_stamps_ns[chosen] - begin, gyro[chosen], accel[chosen], nav)
-        dtype = nav.time_offset.dtype
-        duration = jnp.asarray((end - begin) * 1e-9, dtype)
-        found, _ = _poses_at_samples(nav, batch, jnp.zeros((), dtype), duration)
+        duration = np.asarray((end - begin) * 1e-9, nav.time_offset.dtype)
+        found, _ = _poses_at_samples(nav, batch, np.zeros_like(duration), duration)
         # which samples belong to this span is decided on whole nanoseconds: each one exactly once
         rows = np.asarray(found.wxyz_xyz)[first - chosen.start : last - chosen.start]
         times.append(imu_stamps_ns[first:last] - offset)
@@ -95,9 +95,11 @@ def _padded(
     count = len(since_ns)
     missing = max(_SMALLEST_BATCH, 1 << max(count - 1, 0).bit_length()) - count
     dtype = nav.time_offset.dtype
-    return ImuBatch(
-        time=jnp.asarray(np.pad(since_ns * 1e-9, (0, missing)), dtype),
-        gyro=jnp.asarray(np.pad(gyro, ((0, missing), (0, 0))), dtype),
-        accel=jnp.asarray(np.pad(accel, ((0, missing), (0, 0))), dtype),
-        mask=jnp.arange(count + missing) < count,
-    )
+    # host arrays: jit takes them as they are
+    arrays: dict[str, Any] = {
+        "time": np.pad(since_ns * 1e-9, (0, missing)).astype(dtype),
+        "gyro": np.pad(gyro, ((0, missing), (0, 0))).astype(dtype),
+        "accel": np.pad(accel, ((0, missing), (0, 0))).astype(dtype),
+        "mask": np.arange(count + missing) < count,
+    }
+    return ImuBatch(**arrays)

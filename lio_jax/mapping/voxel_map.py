@@ -8,6 +8,7 @@ number of voxels, such that the vehicle is near its origin.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int32, UInt32
 
 from lio_jax.core.geometry import eigenvalues_and_normal3
@@ -23,6 +24,8 @@ SUBDIVISION = 4
 """Cells per voxel edge; each cell takes one point, remembered in 4 x 4 x 4 = 64 bits."""
 _BATCH = 4096
 """Points inserted at a time: most scans bring fewer new ones, and pay for no more."""
+_OFFSETS = np.concatenate([np.zeros((1, 3), np.int32), np.eye(3, dtype=np.int32)])
+"""To a point's own voxel and one neighbour along each axis."""
 
 
 class VoxelMap(eqx.Module):
@@ -103,18 +106,16 @@ def query_nearest(
     scaled = points / voxel_size
     own = jnp.floor(scaled)
     side = jnp.where(scaled - own > 0.5, 1, -1).astype(jnp.int32)
-    count = points.shape[0]
-    distance = jnp.full(count, jnp.inf, jnp.float32)
-    nearest = jnp.full(count, -1, jnp.int32)
-    for offset in jnp.concatenate([jnp.zeros((1, 3), jnp.int32), jnp.eye(3, dtype=jnp.int32)]):
-        local = own.astype(jnp.int32) + offset * side
-        slot = materialised(find_slots(vmap, local + anchor))
-        away = points - _mean(vmap, jnp.maximum(slot, 0), local, voxel_size)
-        squared = away[:, 0] ** 2 + away[:, 1] ** 2 + away[:, 2] ** 2
-        usable = (slot >= 0) & (_take(vmap.centroid, (jnp.maximum(slot, 0), 3)) >= min_points)
-        closer = usable & (squared < distance)
-        distance = jnp.where(closer, squared, distance)
-        nearest = jnp.where(closer, slot, nearest)
+    local = own.astype(jnp.int32) + _OFFSETS[:, None] * side
+    slots = materialised(find_slots(vmap, local + anchor))
+    held = jnp.maximum(slots, 0)
+    away = points - _mean(vmap, held, local, voxel_size)
+    usable = (slots >= 0) & (_take(vmap.centroid, (held, 3)) >= min_points)
+    squared = jnp.where(usable, away[..., 0] ** 2 + away[..., 1] ** 2 + away[..., 2] ** 2, jnp.inf)
+    distance, nearest = jnp.full_like(squared[0], jnp.inf), jnp.full_like(slots[0], -1)
+    for other, slot in zip(squared, slots, strict=True):
+        nearest = jnp.where(other < distance, slot, nearest)
+        distance = jnp.minimum(other, distance)
     nearest = materialised(nearest)
     found = jnp.maximum(nearest, 0)
     plane = _take(vmap.plane, found)
@@ -182,8 +183,8 @@ def find_slots(vmap: VoxelMap, voxel: Int32[Array, "*b 3"]) -> Int32[Array, "*b"
     slot = jnp.full(voxel.shape[:-1], -1, jnp.int32)
     for way in range(WAYS):
         candidate = first + way
-        x, y, z = (_take(vmap.voxel, (candidate, axis)) == voxel[..., axis] for axis in range(3))
-        slot = jnp.where(x & y & z, candidate, slot)
+        same = _take(vmap.voxel, candidate) == voxel
+        slot = jnp.where(same[..., 0] & same[..., 1] & same[..., 2], candidate, slot)
     return slot
 
 
@@ -228,7 +229,7 @@ def _insert_new(
     cells = cells.at[target, word].add(bit, mode="drop")
 
     mean, diagonal, off_diagonal = _mean_and_covariance(_take(moments, jnp.maximum(slot, 0)))
-    variances, normal = materialised(eigenvalues_and_normal3(diagonal, off_diagonal))
+    variances, normal = eigenvalues_and_normal3(diagonal, off_diagonal)
     count = _take(moments, (jnp.maximum(slot, 0), 0))
     centroid = jnp.concatenate([mean, count[:, None]], -1)
     plane = jnp.concatenate([normal, jnp.maximum(variances[:, :2], 0.0)], -1)
@@ -291,10 +292,10 @@ def _one_per_cell(wants: Bool[Array, " m"], cell: Int32[Array, "m 3"]) -> Bool[A
 
 
 def _mean(
-    vmap: VoxelMap, slot: Int32[Array, " k"], local: Int32[Array, "k 3"], voxel_size: Float32[Array, ""]
-) -> Float32[Array, "k 3"]:
+    vmap: VoxelMap, slot: Int32[Array, "*b"], local: Int32[Array, "*b 3"], voxel_size: Float32[Array, ""]
+) -> Float32[Array, "*b 3"]:
     """Return the means of slots that hold the voxels ``local`` of the anchored frame, m."""
-    return (local.astype(jnp.float32) + 0.5) * voxel_size + _take(vmap.centroid, slot)[:, :3]
+    return (local.astype(jnp.float32) + 0.5) * voxel_size + _take(vmap.centroid, slot)[..., :3]
 
 
 def _mean_and_covariance(moments: Float32[Array, "*b 10"]) -> tuple[Array, Array, Array]:

@@ -17,6 +17,7 @@ from lio_jax.core.settings import Settings
 from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.data.sequence import LidarScan
 from lio_jax.recipes import recipe_named
+from lio_jax.run.compilation import compiled
 from lio_jax.run.failures import Evidence, failure_of, longest_gap
 from lio_jax.run.feed import bucket_for, padded
 from lio_jax.run.imu_feed import ImuFeed
@@ -73,7 +74,7 @@ class CompiledStep:
         key = (name, *(leaf.shape for leaf in jax.tree.leaves(arguments)))
         if key not in self._programs:
             start = time.perf_counter()
-            self._programs[key] = function.lower(*arguments).compile()
+            self._programs[key] = compiled(function.lower(*arguments))
             self.compile_s += time.perf_counter() - start
         return self._programs[key](*arguments)
 
