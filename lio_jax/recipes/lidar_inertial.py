@@ -84,7 +84,8 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
     with jax.named_scope("predict"):
         prior, path = predicted(params, state.uncertain, scan, imu, first)
         T_predicted = lidar_pose(prior.nav)
-        points = deskew_along(path, prior.nav.T_imu_lidar, thin.points, thin.time)
+        still = jax.lax.stop_gradient((path, prior.nav.T_imu_lidar))
+        points = deskew_along(*still, thin.points, thin.time)
         to_match = _to_match(path, prior.nav.T_imu_lidar, thin, points)
     with jax.named_scope("update"):
         frame = Frame(*anchor_of(T_predicted.translation(), params.map.voxel_size))

@@ -1,5 +1,8 @@
 """Compiling programs for a CPU in half the time."""
 
+import time
+from typing import Any
+
 import jax
 
 _CPU_OPTIONS: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False}
@@ -17,3 +20,23 @@ def compiled(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
         if "No such compile option" not in str(error):
             raise
         return lowered.compile()
+
+
+class PerShape:
+    """A jitted function, compiled by :func:`compiled` once for every shape of its arguments."""
+
+    def __init__(self, jitted: Any) -> None:
+        """Keep the function; nothing is compiled yet."""
+        self._jitted = jitted
+        self._programs: dict[Any, Any] = {}
+        self.compile_s = 0.0
+        """Time spent on tracing and compiling so far, s."""
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Run the program for these arguments."""
+        key = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(arguments))
+        if key not in self._programs:
+            start = time.perf_counter()
+            self._programs[key] = compiled(self._jitted.lower(*arguments))
+            self.compile_s += time.perf_counter() - start
+        return self._programs[key](*arguments)

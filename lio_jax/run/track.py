@@ -17,7 +17,7 @@ from lio_jax.core.settings import Settings
 from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.data.sequence import LidarScan
 from lio_jax.recipes import recipe_named
-from lio_jax.run.compilation import compiled
+from lio_jax.run.compilation import PerShape
 from lio_jax.run.failures import Evidence, failure_of, longest_gap
 from lio_jax.run.feed import bucket_for, padded
 from lio_jax.run.imu_feed import ImuFeed
@@ -52,14 +52,17 @@ class CompiledStep:
         self._recipe = recipe = recipe_named(settings.recipe)
         self.config: Config = settings.config
         self.params: Params = settings.params()
-        self.compile_s = 0.0
-        self._init = jax.jit(partial(recipe.init, self.config))
-        self._step = jax.jit(partial(recipe.step, self.config), donate_argnums=1)
-        self._programs: dict[Any, Any] = {}
+        self._init = PerShape(jax.jit(partial(recipe.init, self.config)))
+        self._step = PerShape(jax.jit(partial(recipe.step, self.config), donate_argnums=1))
+
+    @property
+    def compile_s(self) -> float:
+        """Return the time spent on compiling so far, s."""
+        return self._init.compile_s + self._step.compile_s
 
     def initial_state(self, imu: Any) -> Any:
         """Return the recipe's state before the first scan; ``imu``: samples up to its end, or None."""
-        return self._run("init", self._init, self.params, imu)
+        return self._init(self.params, imu)
 
     def restarted(self, state: Any, imu: Any) -> Any:
         """Return the state before the first scan, with the velocity that ``state`` found."""
@@ -68,15 +71,7 @@ class CompiledStep:
 
     def __call__(self, state: Any, scan: Any, imu: Any) -> tuple[Any, Any]:
         """Run one step; ``state`` is consumed."""
-        return self._run("step", self._step, self.params, state, scan, imu)
-
-    def _run(self, name: str, function: Any, *arguments: Any) -> Any:
-        key = (name, *(leaf.shape for leaf in jax.tree.leaves(arguments)))
-        if key not in self._programs:
-            start = time.perf_counter()
-            self._programs[key] = compiled(function.lower(*arguments))
-            self.compile_s += time.perf_counter() - start
-        return self._programs[key](*arguments)
+        return self._step(self.params, state, scan, imu)
 
 
 def track(

@@ -7,6 +7,7 @@ the number of checkpoints, not with the steps.
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -19,12 +20,14 @@ from numpy.typing import NDArray
 from lio_jax.core.config import Config
 from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.recipes import recipe_named
+from lio_jax.run.compilation import PerShape
 from lio_jax.run.track import stepped
 from lio_jax.tuning.objective import Objective, Observed, TruePose
 from lio_jax.tuning.parameters import Free
 from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.streaming import parted
 
+_KINDS = ("init", "restart", "step")
 _SHORTEST = 8
 """Steps between checkpoints at least: the opening, which tries the second scan first, must not be cut."""
 
@@ -82,10 +85,10 @@ class CheckpointedGradient:
             _, pull = jax.vjp(smooth_part, x, smooth, sums)
             return pull(cotangent)
 
-        self.forward = jax.jit(forward, static_argnums=0)
-        self.backward = jax.jit(backward, static_argnums=0)
-        self.add = jax.jit(objective.add)
-        self.value = jax.jit(jax.value_and_grad(objective.value))
+        self.forward = {kind: PerShape(jax.jit(partial(forward, kind))) for kind in _KINDS}
+        self.backward = {kind: PerShape(jax.jit(partial(backward, kind))) for kind in _KINDS}
+        self.add = PerShape(jax.jit(objective.add))
+        self.value = PerShape(jax.jit(jax.value_and_grad(objective.value)))
 
     def __call__(
         self, x: NDArray[np.float64] | Array, recording: Recording, every: int | None = None
@@ -125,7 +128,7 @@ class _Tape:
         self, kind: str, old: _Numbered | None, scan: Scan | None, imu: ImuBatch | None
     ) -> tuple[_Numbered, Any]:
         number = len(self._operations)
-        state, seen = self._programs.forward(kind, self._x, old and old.state, scan, imu)
+        state, seen = self._programs.forward[kind](self._x, old and old.state, scan, imu)
         self._operations.append(_Operation(kind, old.number if old else -1, scan, imu, self._sums))
         if number % self._every == 0:
             self._kept[number] = old and old.state
@@ -146,23 +149,17 @@ class _Tape:
             states = {self._operations[start].source: self._kept.pop(start)}
             for number in segment:
                 one = self._operations[number]
-                states[number], _ = self._programs.forward(
-                    one.kind, self._x, states[one.source], one.scan, one.imu
+                states[number], _ = self._programs.forward[one.kind](
+                    self._x, states[one.source], one.scan, one.imu
                 )
             for number in reversed(segment):
                 one = self._operations[number]
                 bar = state_bar.pop(number, None)
                 if bar is None:
                     bar = jax.tree.map(jnp.zeros_like, parted(states[number])[0])
-                own_bar, source_bar, sums_bar = self._programs.backward(
-                    one.kind,
-                    self._x,
-                    states[one.source],
-                    one.sums,
-                    one.scan,
-                    one.imu,
-                    one.truth,
-                    (bar, sums_bar),
+                fed = (one.sums, one.scan, one.imu, one.truth)
+                own_bar, source_bar, sums_bar = self._programs.backward[one.kind](
+                    self._x, states[one.source], *fed, (bar, sums_bar)
                 )
                 x_bar += own_bar
                 if one.source >= 0:

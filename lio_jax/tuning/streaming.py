@@ -19,6 +19,7 @@ from lio_jax.core.config import Config
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, NOT_FINITE
 from lio_jax.recipes import recipe_named
+from lio_jax.run.compilation import PerShape
 from lio_jax.run.track import stepped
 from lio_jax.tuning.objective import Objective, Observed, TruePose
 from lio_jax.tuning.parameters import Free
@@ -56,8 +57,8 @@ class StreamingGradient:
         self.free = free
         self.objective = objective
         self._steps = _TangentSteps(recipe, config, free)
-        self._add = jax.jit(self._add_with_tangents)
-        self._pushed_value = jax.jit(self._value_with_tangents)
+        self._add = PerShape(jax.jit(self._add_with_tangents))
+        self._pushed_value = PerShape(jax.jit(self._value_with_tangents))
 
     def __call__(self, x: NDArray[np.float64] | Array, recording: Recording) -> Gradient:
         """Return the objective and its gradient at a vector of parameters."""
@@ -117,9 +118,9 @@ class _TangentSteps:
             )
             return _Moving(eqx.combine(smooth, rest), dot), (eqx.combine(seen, unseen), seen_dot)
 
-        self.init = jax.jit(first)
+        self.init = PerShape(jax.jit(first))
         self.recipe = module
-        self.step = jax.jit(step, donate_argnums=1)
+        self.step = PerShape(jax.jit(step, donate_argnums=1))
 
     def at(self, x: Array) -> "_StepAt":
         """Return the programs at a vector of parameters."""

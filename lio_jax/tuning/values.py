@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lio_jax.core.config import Config
 from lio_jax.recipes import recipe_named
+from lio_jax.run.compilation import PerShape
 from lio_jax.run.track import stepped
 from lio_jax.tuning.objective import Objective, Observed
 from lio_jax.tuning.parameters import Free
@@ -28,11 +29,11 @@ class StreamingValues:
             state, output = module.step(config, free(x), state, scan, imu)
             return state, Observed.of(state, output)
 
-        self.init = jax.jit(jax.vmap(lambda x, imu: module.init(config, free(x), imu), (0, None)))
+        self.init = PerShape(jax.jit(jax.vmap(lambda x, imu: module.init(config, free(x), imu), (0, None))))
         self.exchanged = module.moving_as
-        self.step = jax.jit(jax.vmap(one, (0, 0, None, None)), donate_argnums=1)
-        self._add = jax.jit(jax.vmap(objective.add, (0, 0, None)))
-        self._value = jax.jit(jax.vmap(objective.value))
+        self.step = PerShape(jax.jit(jax.vmap(one, (0, 0, None, None)), donate_argnums=1))
+        self._add = PerShape(jax.jit(jax.vmap(objective.add, (0, 0, None))))
+        self._value = PerShape(jax.jit(jax.vmap(objective.value)))
 
     def __call__(self, xs: NDArray[np.float64], recording: Recording) -> NDArray[np.float64]:
         """Return the objective at each row of ``xs``."""
