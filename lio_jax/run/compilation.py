@@ -1,4 +1,7 @@
-"""Compiling programs for a CPU in half the time."""
+"""Compiling programs on a CPU in half the time."""
+
+import gc
+from typing import Any
 
 import jax
 
@@ -6,8 +9,16 @@ _CPU_OPTIONS: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False}
 """XLA's newer emitters of kernels take twice as long, for a step that is no faster."""
 
 
-def compiled(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
-    """Return the executable program."""
+def compiled(function: Any, *arguments: Any) -> jax.stages.Compiled:
+    """Return the program that a jitted function is for these arguments."""
+    # of all that tracing makes nothing is garbage, and looking through it takes a quarter of the time
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        lowered = function.lower(*arguments)
+    finally:
+        if collecting:
+            gc.enable()
     if jax.default_backend() != "cpu":
         return lowered.compile()
     try:

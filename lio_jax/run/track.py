@@ -74,7 +74,7 @@ class CompiledStep:
         key = (name, *(leaf.shape for leaf in jax.tree.leaves(arguments)))
         if key not in self._programs:
             start = time.perf_counter()
-            self._programs[key] = compiled(function.lower(*arguments))
+            self._programs[key] = compiled(function, *arguments)
             self.compile_s += time.perf_counter() - start
         return self._programs[key](*arguments)
 
