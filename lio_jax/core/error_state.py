@@ -7,6 +7,7 @@ gravity turned on its sphere: g <- Exp(B du) g with B a basis of the plane norma
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Float
 
 from lio_jax.core.rotation import rotation_matrix
@@ -80,9 +81,9 @@ def sphere_basis(gravity: Float[Array, "3"]) -> Float[Array, "3 2"]:
     """Return two unit axes normal to ``gravity`` and to each other, smooth near the vertical."""
     up = -gravity / jnp.linalg.norm(gravity)
     # the rotation that takes +z to up, applied to x and y; singular only for gravity that points up
-    axes = jnp.eye(3, dtype=up.dtype)
+    axes = np.eye(3, dtype=up.dtype)
     between = up + axes[2]
-    return axes[:, :2] - jnp.outer(between / between[2], up[:2])
+    return jnp.outer(-between / between[2], up[:2]) + axes[:, :2]
 
 
 def _unit(rotation: jaxlie.SO3) -> jaxlie.SO3:

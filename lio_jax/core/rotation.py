@@ -1,9 +1,11 @@
 """Rotation matrices in few array operations.
 
 Every array operation of a program becomes a kernel that is compiled for itself, whatever its size: nine
-expressions on scalars take longer to compile than one on a matrix.
+expressions on scalars take longer to compile than one on a matrix. And they are jitted within the program,
+because what is called so often takes long to trace.
 """
 
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -18,6 +20,7 @@ def skew(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
     return jnp.take(vector, _ENTRY, axis=-1, mode="clip") * _SIGN
 
 
+@jax.jit
 def rotation_matrix(rotation: jaxlie.SO3) -> Float[Array, "*b 3 3"]:
     """Return the matrix of a quaternion (w, v), whatever its length.
 
@@ -26,6 +29,6 @@ def rotation_matrix(rotation: jaxlie.SO3) -> Float[Array, "*b 3 3"]:
     wxyz = rotation.wxyz
     twice = (2 / jnp.sum(wxyz**2, -1))[..., None, None]
     w, v = wxyz[..., :1, None], wxyz[..., 1:]
-    return (twice * w**2 - 1) * jnp.eye(3, dtype=wxyz.dtype) + twice * (
+    return (twice * w**2 - 1) * np.eye(3, dtype=wxyz.dtype) + twice * (
         v[..., :, None] * v[..., None, :] + w * skew(v)
     )

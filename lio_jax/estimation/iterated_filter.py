@@ -117,11 +117,15 @@ def iterated_update(
     def solve(inputs: tuple) -> Solution:
         prior, measure, _, first_aux, tolerance = inputs
 
+        # jitted so that it is traced once for the shapes and the loop together
+        @jax.jit
+        def blended_at(error: Array, aux: Any) -> _Blend:
+            return blend(measure(retract(prior.state, error), aux), prior, error)
+
         def iterate(carry: tuple) -> tuple:
             error, iteration, _, _, last = carry
-            measured = measure(retract(prior.state, error), last.measured.aux)
-            blended = blend(measured, prior, error)
-            innovation = blended.innovation
+            blended = blended_at(error, last.measured.aux)
+            measured, innovation = blended.measured, blended.innovation
             following = -blended.PH @ innovation.solve(innovation.whitened[:, None])[:, 0]
             lost = measured.lost | ~jnp.all(jnp.isfinite(following))
             done = lost | (measured.settled & jnp.all(jnp.abs(following - error) <= tolerance))
@@ -131,11 +135,9 @@ def iterated_update(
             return (carry[1] < max_iterations) & ~carry[2]
 
         error = jnp.zeros(covariance.shape[0], covariance.dtype)
-        measured = _blank(jax.eval_shape(lambda: measure(prior.state, first_aux)))
+        blank = _blank(jax.eval_shape(blended_at, error, first_aux))
         if first_aux is not None:
-            measured = eqx.tree_at(lambda blank: blank.aux, measured, first_aux)
-        blank = _blank(jax.eval_shape(lambda: blend(measured, prior, error)))
-        blank = eqx.tree_at(lambda blank: blank.measured, blank, measured)
+            blank = eqx.tree_at(lambda blank: blank.measured.aux, blank, first_aux)
         start = (error, jnp.int32(0), jnp.array(False), jnp.array(False), blank)
         error, iterations, done, lost, last = jax.lax.while_loop(unfinished, iterate, start)
         return Solution(error, _Loop(last.measured.aux, iterations, done, lost), last)

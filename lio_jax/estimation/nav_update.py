@@ -79,12 +79,12 @@ def reset_jacobian(nav: NavState, error: Float[Array, "24"]) -> Float[Array, "24
     turns = jnp.stack([-error[ROTATION], -error[EXTRINSIC_ROTATION], basis @ error[GRAVITY]])
     back, _, turn = rotation_exponential(turns)
     jacobian, extrinsic_jacobian, gravity_jacobian = rotation_integrals(turns)[0]
-    identity = jnp.eye(DOF, dtype=error.dtype)
+    identity = jnp.eye(6, dtype=error.dtype)
     blocks = (
         (ROTATION, jacobian),
         (POSITION, back),
         (VELOCITY, back),
-        (BIASES, identity[:6, :6]),
+        (BIASES, identity),
         (GRAVITY, sphere_basis(turn @ nav.gravity).T @ gravity_jacobian @ basis),
         (EXTRINSIC_ROTATION, extrinsic_jacobian),
         (slice(EXTRINSIC_TRANSLATION.start, TIME_OFFSET.stop), identity[:4, :4]),

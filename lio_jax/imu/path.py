@@ -126,9 +126,8 @@ def _carried(motion: _Motion, time: Float[Array, " n"], points: Float[Array, "n 
     x, y, z = points.T
     p = _each(lambda i: x * x_axis[i] + y * y_axis[i] + z * z_axis[i] + arm[i])
     w = _each(lambda i: h * rate[i])
-    series = rotation_series(jnp.minimum(sum(x**2 for x in w), SERIES_LIMIT))
     # once, instead of once for each column
-    a, b, c, d = materialised(series)
+    a, b, c, d = materialised(rotation_series(jnp.minimum(sum(x**2 for x in w), SERIES_LIMIT)))
     turned, pushed = _cross(w, p), _cross(w, force)
     twice, pushed_twice = _cross(w, turned), _cross(w, pushed)
 

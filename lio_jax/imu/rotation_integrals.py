@@ -2,6 +2,7 @@
 
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -17,6 +18,7 @@ _TERMS = 12
 _FACTORIALS = np.array([math.factorial(n) for n in range(2 * _TERMS + 5)], float)
 
 
+@jax.jit
 def rotation_coefficients(angle_squared: Float[Array, "*b"]) -> Float[Array, "*b 6"]:
     """Return s_n, the sum over k of (-t^2)^k / (2k+n)!, for n from 1 to 6.
 
@@ -35,25 +37,24 @@ def rotation_coefficients(angle_squared: Float[Array, "*b"]) -> Float[Array, "*b
     angle = jnp.sqrt(safe)
     ab = jnp.concatenate([jnp.sin(angle) / angle, (1 - jnp.cos(angle)) / safe], -1)
     # s_(n+2) = (1/n! - s_n) / t^2
-    cd = (jnp.array([1, 1 / 2], ab.dtype) - ab) / safe
-    ef = (jnp.array([1 / 6, 1 / 24], ab.dtype) - cd) / safe
+    cd = (np.array([1, 1 / 2], ab.dtype) - ab) / safe
+    ef = (np.array([1 / 6, 1 / 24], ab.dtype) - cd) / safe
     exact = jnp.concatenate([ab, cd, ef], -1)
     return jnp.where(small, _series(jnp.where(small, square, 0.0), np.arange(1, 7)), exact)
 
 
-def rotation_series(angle_squared: Float[Array, "*b"]) -> tuple[Array, Array, Array, Array]:
+def rotation_series(angle_squared: Float[Array, " n"]) -> Float[Array, "4 n"]:
     """Return the first four of :func:`rotation_coefficients` up to ``SERIES_LIMIT``, cheap in batches.
 
     Args:
         angle_squared: rad^2.
     """
-    a, b, c, d = (_series(angle_squared, order) for order in (1, 2, 3, 4))
-    return a, b, c, d
+    return _series(angle_squared, np.arange(1, 5)[:, None])
 
 
-def _series(x: Float[Array, "*b"], order: int | NDArray[np.intp]) -> Array:
-    """Return the sum over k of (-x)^k / (2 k + order)!."""
-    total: Array = jnp.zeros_like(x)
+def _series(x: Float[Array, "*b"], order: NDArray[np.intp]) -> Array:
+    """Return the sums over k of (-x)^k / (2 k + order)!."""
+    total: Array = jnp.zeros((), x.dtype)
     for k in reversed(range(_TERMS)):
         total = -x * total + np.asarray(1 / _FACTORIALS[2 * k + order], x.dtype)
     return total

@@ -86,7 +86,7 @@ def _follow(nav: NavState, intervals: Intervals, start: Float[Array, ""]) -> tup
     elapsed = increments.time[:, None]
     fall = elapsed * (nav.velocity + elapsed / 2 * gravity)
     position = nav.T_world_imu.translation() + fall + increments.position @ matrix.T
-    turned = jax.vmap(lambda gained: (rotation @ gained).normalize())(increments.rotation)
+    turned = (rotation @ increments.rotation).normalize()
     path = Path(
         time=start + increments.time,
         T_world_imu=jaxlie.SE3.from_rotation_and_translation(turned, position),

@@ -1,5 +1,6 @@
-"""Compiling programs for a CPU in half the time."""
+"""Compiling programs on a CPU in half the time."""
 
+import gc
 import time
 from typing import Any
 
@@ -9,8 +10,16 @@ _CPU_OPTIONS: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False}
 """XLA's newer emitters of kernels take twice as long, for a step that is no faster."""
 
 
-def compiled(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
-    """Return the executable program."""
+def compiled(function: Any, *arguments: Any) -> jax.stages.Compiled:
+    """Return the program that a jitted function is for these arguments."""
+    # of all that tracing makes nothing is garbage, and looking through it takes a quarter of the time
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        lowered = function.lower(*arguments)
+    finally:
+        if collecting:
+            gc.enable()
     if jax.default_backend() != "cpu":
         return lowered.compile()
     try:
@@ -37,6 +46,6 @@ class PerShape:
         key = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(arguments))
         if key not in self._programs:
             start = time.perf_counter()
-            self._programs[key] = compiled(self._jitted.lower(*arguments))
+            self._programs[key] = compiled(self._jitted, *arguments)
             self.compile_s += time.perf_counter() - start
         return self._programs[key](*arguments)

@@ -1,5 +1,7 @@
 """The compiler's options hold where the compiler knows them, and do not matter where it does not."""
 
+import gc
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,12 +13,21 @@ from lio_jax.run import compilation
 @pytest.mark.parametrize("options", [compilation._CPU_OPTIONS, {"xla_cpu_an_option_of_another_day": True}])
 def test_a_program_is_compiled_whether_or_not_the_options_are_known(options, monkeypatch):
     monkeypatch.setattr(compilation, "_CPU_OPTIONS", options)
-    program = compilation.compiled(jax.jit(lambda x: jnp.sum(jnp.sin(x) ** 2)).lower(jnp.arange(3.0)))
+    program = compilation.compiled(jax.jit(lambda x: jnp.sum(jnp.sin(x) ** 2)), jnp.arange(3.0))
     assert program(jnp.arange(3.0)) == pytest.approx(np.sum(np.sin(np.arange(3)) ** 2))
 
 
 def test_an_impossible_value_is_no_unknown_option(monkeypatch):
     monkeypatch.setattr(compilation, "_CPU_OPTIONS", {"xla_cpu_use_fusion_emitters": "perhaps"})
-    lowered = jax.jit(lambda x: x + 1).lower(1.0)
     with pytest.raises(jax.errors.JaxRuntimeError):
-        compilation.compiled(lowered)
+        compilation.compiled(jax.jit(lambda x: x + 1), 1.0)
+
+
+def test_the_collector_works_on_whatever_happens():
+    def impossible(x):
+        assert not gc.isenabled()
+        raise ValueError("not to be traced")
+
+    with pytest.raises(ValueError, match="not to be traced"):
+        compilation.compiled(jax.jit(impossible), 1.0)
+    assert gc.isenabled()

@@ -1,0 +1,130 @@
+"""Running sums against evo's metrics and numpy, and derivatives of the alignment."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+
+from lio_jax.core.errors import UsageError
+from lio_jax.core.types import initial_nav_state
+from lio_jax.data.trajectory import Trajectory
+from lio_jax.evaluation.evaluate import evaluate
+from lio_jax.tuning.named_objectives import objective_named
+from lio_jax.tuning.objective import Observed, TruePose
+from lio_jax.tuning.objectives import MeanOverScans, WeightedSum
+from lio_jax.tuning.trajectory_objectives import AbsoluteError, RelativeError
+
+COUNT = 40
+
+
+def poses(seed, noise=0.0):
+    """Return (n, 7) wxyz_xyz along a curve, shaken by ``noise``."""
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0, 3, COUNT)
+    position = np.stack([5 * time, np.sin(2 * time), 0.2 * time**2], 1) + noise * rng.normal(size=(COUNT, 3))
+    turn = np.stack([0.1 * time, 0.05 * time, 0.7 * time], 1) + noise * rng.normal(size=(COUNT, 3))
+    wxyz = jax.vmap(lambda w: jaxlie.SO3.exp(w).wxyz)(jnp.asarray(turn))
+    return jnp.concatenate([wxyz, jnp.asarray(position)], 1)
+
+
+def seen_at(pose, lost=False):
+    nav = initial_nav_state(jaxlie.SE3.identity())
+    nav = dataclasses.replace(nav, T_world_imu=jaxlie.SE3(pose))
+    return Observed(nav, jnp.array(0.1), jnp.int32(0), jnp.array(lost), None, None)
+
+
+def loss(objective, estimate, truth, known=None):
+    sums = objective.start()
+    for k in range(COUNT):
+        true = TruePose(jaxlie.SE3(truth[k]), jnp.array(True if known is None else bool(known[k])))
+        sums = objective.add(sums, seen_at(estimate[k]), true)
+    return objective.value(sums)
+
+
+def trajectory(rows):
+    stamps = np.arange(COUNT) * 100_000_000
+    return Trajectory(stamps, np.asarray(jax.vmap(lambda row: jaxlie.SE3(row).as_matrix())(rows)))
+
+
+def test_absolute_error_is_that_of_evo():
+    estimate, truth = poses(0, 0.05), poses(1)
+    expected = evaluate(trajectory(estimate), trajectory(truth)).as_dict()["ate"]["rmse"]
+    assert float(loss(AbsoluteError(), estimate, truth)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_relative_error_is_that_of_its_definition():
+    estimate, truth = poses(0, 0.05), poses(1)
+    p, q = trajectory(estimate).poses, trajectory(truth).poses
+    errors = [
+        np.linalg.inv(np.linalg.inv(q[k]) @ q[k + 10]) @ np.linalg.inv(p[k]) @ p[k + 10]
+        for k in range(COUNT - 10)
+    ]
+    moved = np.sqrt(np.mean([error[:3, 3] @ error[:3, 3] for error in errors]))
+    turned = np.sqrt(
+        np.mean([np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1)) ** 2 for error in errors])
+    )
+    assert float(loss(RelativeError(), estimate, truth)) == pytest.approx(moved, rel=1e-9)
+    assert float(loss(RelativeError(rotation=True), estimate, truth)) == pytest.approx(turned, rel=1e-6)
+
+
+@pytest.mark.parametrize("objective", [AbsoluteError(), RelativeError()], ids=["ate", "rpe"])
+@pytest.mark.parametrize("flat", [False, True], ids=["curve", "in a plane"])
+def test_derivatives_agree_with_central_differences(objective, flat):
+    estimate, truth = poses(0, 0.05), poses(1)
+    if flat:
+        truth = truth.at[:, 6].set(0.0)
+    direction = jnp.zeros_like(estimate).at[:, 4:].set(np.random.default_rng(2).normal(size=(COUNT, 3)))
+
+    def along(t):
+        return loss(objective, estimate + t * direction, truth)
+
+    step = 1e-6
+    expected = (along(step) - along(-step)) / (2 * step)
+    assert float(jax.jvp(along, (0.0,), (1.0,))[1]) == pytest.approx(float(expected), rel=1e-6)
+
+
+def test_poses_without_truth_do_not_count():
+    estimate, truth = poses(0, 0.05), poses(1)
+    known = np.arange(COUNT) < 25
+    broken = truth.at[25:, 4:].set(1e3)
+    whole = loss(AbsoluteError(), estimate, broken, known)
+    sums = AbsoluteError().start()
+    for k in range(25):
+        sums = AbsoluteError().add(
+            sums, seen_at(estimate[k]), TruePose(jaxlie.SE3(truth[k]), jnp.array(True))
+        )
+    assert float(whole) == pytest.approx(float(AbsoluteError().value(sums)), rel=1e-12)
+
+
+def test_the_mean_leaves_out_lost_scans_and_the_opening():
+    mean = MeanOverScans(lambda seen, truth: seen.nav.T_world_imu.translation()[0], skip=2)
+    sums, truth = mean.start(), TruePose(jaxlie.SE3.identity(), jnp.array(False))
+    for k, lost in enumerate([False, False, False, True, False]):
+        sums = mean.add(sums, seen_at(jnp.array([1.0, 0, 0, 0, k, 0, 0]), lost), truth)
+    assert float(mean.value(sums)) == pytest.approx((2 + 4) / 2)
+
+
+def test_sums_of_objectives_by_name():
+    estimate, truth = poses(0, 0.05), poses(1)
+    named = objective_named("ate+0.5*rpe")
+    assert named.needs_truth
+    assert not named.likelihood
+    assert isinstance(named.objective, WeightedSum)
+    expected = loss(AbsoluteError(), estimate, truth) + 0.5 * loss(RelativeError(), estimate, truth)
+    assert float(loss(named.objective, estimate, truth)) == pytest.approx(float(expected))
+    assert objective_named("noise").likelihood
+
+
+@pytest.mark.parametrize("text", ["atte", "ate+rpf", "x*ate"])
+def test_an_unknown_objective_lists_those_there_are(text):
+    with pytest.raises(UsageError, match=r"there are: pose|is no number"):
+        objective_named(text)
+
+
+@pytest.mark.parametrize("name", ["pose", "point", "planes"])
+def test_innovations_want_a_filter(name):
+    with pytest.raises(UsageError, match="ate, rpe or map"):
+        loss(MeanOverScans(objective_named(name).objective.loss), poses(0), poses(1))

@@ -1,0 +1,52 @@
+"""From patterns to a vector of parameters and back."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lio_jax.core.errors import UsageError
+from lio_jax.core.params import default_params
+from lio_jax.tuning.parameters import free_parameters
+
+
+def test_positive_parameters_are_logarithms_and_the_rest_stays():
+    free = free_parameters(default_params(), ["params.imu.*_noise", "lidar.range_sigma"])
+    assert free.names == ("imu.gyro_noise", "imu.accel_noise", "lidar.range_sigma")
+    params = free(free.first() + jnp.log(jnp.array([2.0, 3.0, 0.5])))
+    start = default_params()
+    assert float(params.imu.gyro_noise) == pytest.approx(2 * float(start.imu.gyro_noise))
+    assert float(params.imu.accel_noise) == pytest.approx(3 * float(start.imu.accel_noise))
+    assert float(params.lidar.range_sigma) == pytest.approx(0.5 * float(start.lidar.range_sigma))
+    assert params.registration == start.registration
+
+
+def test_extrinsics_turn_and_shift_from_their_start():
+    free = free_parameters(default_params(), ["extrinsics.*"])
+    turn, shift = np.array([0.1, -0.2, 0.3]), np.array([1.0, 2.0, 3.0])
+    x = free.first() + jnp.concatenate([jnp.asarray(turn), jnp.asarray(shift), jnp.array([0.02])])
+    written = free.overrides(np.asarray(x))
+    expected = Rotation.from_rotvec(turn)
+    assert (Rotation.from_quat(written["params.extrinsics.rotation"]) * expected.inv()).magnitude() < 1e-12
+    np.testing.assert_allclose(written["params.extrinsics.translation"], shift)
+    assert written["params.extrinsics.time_offset"] == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize(
+    ("patterns", "words"),
+    [
+        (["map.voxel_size"], ["map.voxel_size", "no derivative", "imu.gyro_noise"]),
+        (["imu.gyro_noize"], ["imu.gyro_noize", "imu.gyro_noise"]),
+        (["lidar.angle_sigma"], ["lidar.angle_sigma", "is 0", "--set"]),
+        ([], ["no parameter to tune"]),
+    ],
+)
+def test_what_can_not_be_tuned_is_said_in_one_sentence(patterns, words):
+    with pytest.raises(UsageError) as raised:
+        free_parameters(default_params(), patterns)
+    assert all(word in str(raised.value) for word in words)
+
+
+def test_a_glob_takes_what_it_can():
+    free = free_parameters(default_params(), ["lidar.*", "registration.*"])
+    assert free.paths == ("lidar.range_sigma", "registration.kernel", "registration.information_scale")
