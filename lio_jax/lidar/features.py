@@ -136,7 +136,7 @@ def lio_sam_rings(config: Config, params: Params, scan: Scan) -> Rings:
     limits, neighbours = params.features, config.features.neighbours
     with jax.named_scope("smoothness"):
         x, y, z = xyz
-        ranges, column, mask = materialised((jnp.sqrt(x**2 + y**2 + z**2), image.column, image.mask))
+        ranges, column, mask = materialised(jnp.sqrt(x**2 + y**2 + z**2)), image.column, image.mask
         hidden = occluded(
             ranges,
             column,
@@ -177,7 +177,7 @@ def _measured(
 ) -> Rings:
     settings = config.features
     before, after = reach(connected, settings.neighbours)
-    ring = Ring(*materialised((smoothness, open_, before, after)), settings.neighbours)
+    ring = Ring(smoothness, open_, before, after, settings.neighbours)
     return Rings(image, xyz, time, ring, sector_bounds(image.count, settings.sectors, settings.neighbours))
 
 

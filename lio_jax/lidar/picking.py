@@ -14,8 +14,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float32, Int32
 
-from lio_jax.core.materialise import materialised
-
 _CLOSED = -1
 """Key of a point that can't be picked any more; open points have non-negative keys."""
 
@@ -86,8 +84,8 @@ def pick(
     ) -> tuple[Array, tuple[Array, Array]]:
         start, end = ends
         place = start + row
-        keys, reached = materialised(
-            [image.ravel().at[place * rings + number].get(mode="clip") for image in (sharpness, reach)]
+        keys, reached = (
+            image.ravel().at[place * rings + number].get(mode="clip") for image in (sharpness, reach)
         )
         keys = jnp.where((place >= free) & (place < end), keys, _CLOSED)
         turns = _Turns(start, row, reached, bits)

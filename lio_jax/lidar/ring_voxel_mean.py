@@ -81,7 +81,7 @@ def _first_of_voxel(
     cell = jnp.arange(cells, dtype=jnp.int32)
     x, y, z = (axis.astype(jnp.uint32) for axis in voxel)
     name = (x % 2048 << 21) | (y % 2048 << 10) | z % 1024
-    name, mixed = materialised((name.ravel(), voxel_hash(jnp.stack(voxel, -1)).ravel()))
+    name, mixed = name.ravel(), voxel_hash(jnp.stack(voxel, -1)).ravel()
 
     def one(turn: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         first, unsettled, salt = turn
