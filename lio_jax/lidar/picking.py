@@ -7,6 +7,8 @@ as well. Equal values are ordered by their place along the ring (a stable ascend
 for corners).
 
 Rings do not touch each other, so the rule runs on all rings at once: one pick a turn is the sector's maximum.
+Sectors do, so they follow one another. On a CPU a turn over 64 rings takes 10 us: an argmax, or rings as rows
+of the array, take twice as long, and picking all local extremes at once until none is left no less in all.
 """
 
 import equinox as eqx
