@@ -90,6 +90,34 @@ class KnnConfig:
 
 
 @dataclass(frozen=True)
+class FeaturesConfig:
+    """Corners and flat points along the sensor's rings."""
+
+    rings: int = 64
+    """Rings of the sensor; points of a ring beyond are reported as dropped."""
+    ring_step: int = 1
+    """Every how many rings one is used."""
+    columns: int = 2304
+    """Columns of a full turn where points are ordered by azimuth; else the points a ring has room for."""
+    order: Literal["arrival", "azimuth"] = "arrival"
+    """How a ring's points follow each other: as the recording has them (A-LOAM; the lines of a Livox), or by
+    columns of equal azimuth, of which the first point takes each (LIO-SAM)."""
+    neighbours: int = 5
+    """Points on either side that make up the smoothness of a point, and that a pick suppresses; as many are
+    left unused at both ends of a ring."""
+    sectors: int = 6
+    """Sectors of a ring, picked from one after another."""
+    sharp: int = 2
+    """Sharpest corners of a sector, which are matched against the less sharp ones."""
+    corners: int = 20
+    """Corners of a sector, the sharpest included."""
+    flat: int = 4
+    """Flattest points of a sector, which are matched against the surfaces."""
+    surface_points: int = 49152
+    """Capacity of the downsampled surface points."""
+
+
+@dataclass(frozen=True)
 class FastLio2Config:
     """What the recipe fast_lio2 has of its own."""
 
@@ -124,6 +152,7 @@ class Config:
     map: MapConfig = field(default_factory=MapConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     knn: KnnConfig = field(default_factory=KnnConfig)
+    features: FeaturesConfig = field(default_factory=FeaturesConfig)
     fast_lio2: FastLio2Config = field(default_factory=FastLio2Config)
     output: OutputConfig = field(default_factory=OutputConfig)
 

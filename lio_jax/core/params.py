@@ -115,6 +115,27 @@ class KnnParams(eqx.Module):
     """A match counts if its score is larger than this."""
 
 
+class FeatureParams(eqx.Module):
+    """What counts as a corner, as flat, and as too doubtful for either."""
+
+    corner_threshold: Scalar
+    """Corners have a smoothness above this, m^2 (LIO-SAM's, of ranges: 1.0)."""
+    flat_threshold: Scalar
+    """Flat points have a smoothness below this, m^2."""
+    connected_distance: Scalar
+    """A pick suppresses its neighbours as far as points that follow each other are no farther apart, m ..."""
+    connected_columns: Scalar
+    """... or, in LIO-SAM, no more columns than this."""
+    occlusion_step: Scalar
+    """Points behind an edge with a larger difference in range than this are no features, m ..."""
+    occlusion_columns: Scalar
+    """... if the edge's two points are fewer columns than this apart."""
+    parallel_ratio: Scalar
+    """No feature is a point whose range differs from both neighbours' by more than this share of it."""
+    surface_spacing: Scalar
+    """Surface points are averaged per ring and cube of this edge, m (LIO-SAM: 0.4)."""
+
+
 class PointMapParams(eqx.Module):
     """A map of one point per voxel, inside a cube that follows the sensor."""
 
@@ -175,6 +196,7 @@ class Params(eqx.Module):
     map: MapParams
     registration: RegistrationParams
     knn: KnnParams
+    features: FeatureParams
     point_map: PointMapParams
     motion: MotionParams
     limits: LimitParams
@@ -212,6 +234,16 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "min_matches": 50.0,
     },
     "knn": {"radius": 5**0.5, "plane_tolerance": 0.1, "distance_weight": 0.9, "min_score": 0.9},
+    "features": {
+        "corner_threshold": 0.1,
+        "flat_threshold": 0.1,
+        "connected_distance": 0.05**0.5,
+        "connected_columns": 10.0,
+        "occlusion_step": 0.3,
+        "occlusion_columns": 10.0,
+        "parallel_ratio": 0.02,
+        "surface_spacing": 0.2,
+    },
     "point_map": {"cube_side_length": 1000.0, "cube_margin": 1.5, "nearer_by": 0.1},
     "motion": {"initial_error": 2.0, "error_decay": 0.5},
     "limits": {"speed": 30.0, "gyro_bias": 1.0, "accel_bias": 1.0, "outage": 1.0},

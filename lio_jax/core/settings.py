@@ -166,6 +166,12 @@ def checked_together(settings: Settings, source: str) -> Settings:
             f"{source}: params.lidar.min_range ({lidar['min_range']}) must be below "
             f"params.lidar.max_range ({lidar['max_range']})."
         )
+    features = settings.config.features
+    if features.columns <= 2 * features.neighbours:
+        raise UsageError(
+            f"{source}: config.features.columns ({features.columns}) must be more than twice "
+            f"config.features.neighbours ({features.neighbours})."
+        )
     return settings
 
 

@@ -59,6 +59,12 @@ def values_for(path: str) -> st.SearchStrategy:
     kind = CONFIG[path]
     if path == "config.map.capacity":
         return st.integers(1, 24).map(lambda bits: 2**bits)
+    if path == "config.knn.neighbours":
+        return st.integers(3, 100)
+    if path == "config.features.neighbours":
+        return st.integers(1, 100)
+    if path == "config.features.columns":
+        return st.integers(201, 10**5)
     if path.endswith(".buckets"):
         return st.lists(st.integers(1, 10**6), min_size=1, max_size=6, unique=True).map(sorted)
     if get_origin(kind) is Literal:

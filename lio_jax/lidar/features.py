@@ -1,0 +1,224 @@
+"""Corners and flat points along the rings of a scan: the front ends of LOAM and LIO-SAM.
+
+    scan -> range image -> smoothness, masks -> picks, sector by sector -> corners, flat points
+                                                   \\-> what is no corner -> mean per ring and voxel
+
+Indices carry no gradient; the points they gather, and the means, do.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float32, Int32
+
+from lio_jax.core.config import Config
+from lio_jax.core.materialise import materialised
+from lio_jax.core.params import Params
+from lio_jax.core.types import Scan
+from lio_jax.lidar.picking import Picks, Ring, pick, sector_bounds
+from lio_jax.lidar.range_image import RangeImage, range_image
+from lio_jax.lidar.ring_voxel_mean import mean_per_ring_and_voxel
+from lio_jax.lidar.smoothness import (
+    after_each,
+    occluded,
+    parallel_to_beam,
+    point_smoothness,
+    range_smoothness,
+    reach,
+)
+
+
+class FeatureCloud(eqx.Module):
+    """Points of one kind, padded to n."""
+
+    points: Float32[Array, "n 3"]
+    """m, lidar frame at each point's own firing time."""
+    time: Float32[Array, " n"]
+    """Firing time from the scan's start, s."""
+    ring: Int32[Array, " n"]
+    mask: Bool[Array, " n"]
+
+
+class LoamFeatures(eqx.Module):
+    """What A-LOAM's scan registration hands on."""
+
+    sharp: FeatureCloud
+    less_sharp: FeatureCloud
+    """The sharp ones included."""
+    flat: FeatureCloud
+    less_flat: FeatureCloud
+    """All points that are not less sharp, averaged per ring and voxel."""
+    dropped: Int32[Array, ""]
+    """Points, and rows of ``less_flat``, that found no room in the capacities."""
+
+
+class LioSamFeatures(eqx.Module):
+    """What LIO-SAM's feature extraction hands on."""
+
+    corner: FeatureCloud
+    surface: FeatureCloud
+    """All points that are not corners, averaged per ring and voxel."""
+    dropped: Int32[Array, ""]
+    """Points, and rows of ``surface``, that found no room in the capacities."""
+
+
+class Rings(eqx.Module):
+    """A scan along its rings, and what is known about each point there."""
+
+    image: RangeImage
+    xyz: tuple[Float32[Array, "k rings"], Float32[Array, "k rings"], Float32[Array, "k rings"]]
+    """m; zero where there is no point."""
+    time: Float32[Array, "k rings"]
+    """s."""
+    ring: Ring
+    bounds: Int32[Array, "bounds rings"]
+    """Of the sectors."""
+
+
+def loam_features(config: Config, params: Params, scan: Scan) -> LoamFeatures:
+    """Pick LOAM's features.
+
+    Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014, section V.A, in A-LOAM's form.
+
+    Args:
+        config: ``config.features``.
+        params: ``params.features`` and the range limits of ``params.lidar``.
+        scan: padded sweep.
+    """
+    rings = loam_rings(config, params, scan)
+    picks = _picked(config, params, rings, config.features.flat)
+    less_flat, dropped = _surface(config, params, rings, picks)
+    return LoamFeatures(
+        sharp=_cloud(scan, rings, picks.corners[: config.features.sharp]),
+        less_sharp=_cloud(scan, rings, picks.corners),
+        flat=_cloud(scan, rings, picks.flats),
+        less_flat=less_flat,
+        dropped=rings.image.dropped + dropped,
+    )
+
+
+def lio_sam_features(config: Config, params: Params, scan: Scan) -> LioSamFeatures:
+    """Pick LIO-SAM's features.
+
+    Shan et al., "LIO-SAM: Tightly-coupled lidar inertial odometry via smoothing and mapping", IROS 2020,
+    section III.C, as its program does it: flat points only keep corners away from themselves.
+
+    Args:
+        config: ``config.features``, with ``order="azimuth"`` unless the rings are the lines of a Livox.
+        params: ``params.features`` and the range limits of ``params.lidar``.
+        scan: padded sweep.
+    """
+    rings = lio_sam_rings(config, params, scan)
+    picks = _picked(config, params, rings, None)
+    surface, dropped = _surface(config, params, rings, picks)
+    return LioSamFeatures(
+        corner=_cloud(scan, rings, picks.corners), surface=surface, dropped=rings.image.dropped + dropped
+    )
+
+
+def loam_rings(config: Config, params: Params, scan: Scan) -> Rings:
+    """Return the scan's rings with the smoothness of the points in 3-D; every point may be picked.
+
+    Suppression ends where points that follow each other are farther apart than ``connected_distance``, in
+    place of the paper's tests for occlusion and for surfaces along the beam.
+    """
+    image, xyz, time = _gathered(config, params, scan)
+    with jax.named_scope("smoothness"):
+        gap_squared = sum(((after_each(axis) - axis) ** 2 for axis in xyz), jnp.float32(0.0))
+        connected = gap_squared <= params.features.connected_distance.astype(jnp.float32) ** 2
+        smoothness = point_smoothness(xyz, config.features.neighbours)
+        return _measured(config, image, xyz, time, smoothness, image.mask, connected)
+
+
+def lio_sam_rings(config: Config, params: Params, scan: Scan) -> Rings:
+    """Return the scan's rings with the smoothness of the ranges, without hidden and grazed points."""
+    image, xyz, time = _gathered(config, params, scan)
+    limits, neighbours = params.features, config.features.neighbours
+    with jax.named_scope("smoothness"):
+        x, y, z = xyz
+        ranges, column, mask = materialised(jnp.sqrt(x**2 + y**2 + z**2)), image.column, image.mask
+        hidden = occluded(
+            ranges,
+            column,
+            mask,
+            step=limits.occlusion_step.astype(jnp.float32),
+            columns_apart=limits.occlusion_columns.astype(jnp.float32),
+            neighbours=neighbours,
+        )
+        grazed = parallel_to_beam(ranges, limits.parallel_ratio.astype(jnp.float32))
+        apart = jnp.abs(after_each(column) - column).astype(jnp.float32)
+        connected = apart <= limits.connected_columns.astype(jnp.float32)
+        smoothness = range_smoothness(ranges, neighbours)
+        return _measured(config, image, xyz, time, smoothness, mask & ~hidden & ~grazed, connected)
+
+
+def _gathered(
+    config: Config, params: Params, scan: Scan
+) -> tuple[RangeImage, tuple[Array, Array, Array], Array]:
+    """Return the range image, and x, y, z and the time along its rings."""
+    with jax.named_scope("range_image"):
+        image = range_image(config.features, params, scan)
+        x, y, z, time = (
+            jnp.where(image.mask, values.at[image.index].get(mode="clip"), 0.0)
+            for values in (*(scan.points[:, axis] for axis in range(3)), scan.time)
+        )
+        x, y, z, time = materialised((x, y, z, time))
+    return image, (x, y, z), time
+
+
+def _measured(
+    config: Config,
+    image: RangeImage,
+    xyz: tuple[Array, Array, Array],
+    time: Float32[Array, "k rings"],
+    smoothness: Float32[Array, "k rings"],
+    open_: Bool[Array, "k rings"],
+    connected: Bool[Array, "k rings"],
+) -> Rings:
+    settings = config.features
+    before, after = reach(connected, settings.neighbours)
+    ring = Ring(smoothness, open_, before, after, settings.neighbours)
+    return Rings(image, xyz, time, ring, sector_bounds(image.count, settings.sectors, settings.neighbours))
+
+
+def _picked(config: Config, params: Params, rings: Rings, flats: int | None) -> Picks:
+    with jax.named_scope("pick"):
+        return pick(
+            rings.ring,
+            rings.bounds,
+            corner_threshold=params.features.corner_threshold.astype(jnp.float32),
+            flat_threshold=params.features.flat_threshold.astype(jnp.float32),
+            corners=config.features.corners,
+            flats=flats,
+        )
+
+
+def _cloud(scan: Scan, rings: Rings, places: Int32[Array, "c sectors rings"]) -> FeatureCloud:
+    """Return the points at places along the rings."""
+    number = jnp.broadcast_to(jnp.arange(places.shape[-1], dtype=jnp.int32), places.shape)
+    mask = (places >= 0).ravel()
+    index = rings.image.index[jnp.maximum(places, 0), number].ravel()
+    return FeatureCloud(
+        points=jnp.where(mask[:, None], scan.points[index], 0.0),
+        time=jnp.where(mask, scan.time[index], 0.0),
+        ring=jnp.where(mask, number.ravel(), 0),
+        mask=mask,
+    )
+
+
+def _surface(
+    config: Config, params: Params, rings: Rings, picks: Picks
+) -> tuple[FeatureCloud, Int32[Array, ""]]:
+    """Return what lies in a sector and is no corner, averaged per ring and voxel, and the rows left out."""
+    k, count = rings.time.shape
+    with jax.named_scope("surface"):
+        number = jnp.arange(count, dtype=jnp.int32)
+        cell = jnp.where(picks.corners >= 0, picks.corners * count + number, k * count)
+        corner = jnp.zeros(k * count, bool).at[cell.ravel()].set(True, mode="drop").reshape(k, count)
+        place = jnp.arange(k, dtype=jnp.int32)[:, None]
+        surface = (place >= rings.bounds[0]) & (place < rings.bounds[-1]) & ~corner
+        spacing = params.features.surface_spacing.astype(jnp.float32)
+        means = mean_per_ring_and_voxel(
+            rings.xyz, rings.time, surface, spacing, config.features.surface_points
+        )
+    return FeatureCloud(means.points, means.time, means.ring, means.mask), means.dropped
