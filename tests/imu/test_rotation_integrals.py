@@ -13,7 +13,6 @@ from lio_jax.imu.rotation_integrals import (
     rotation_exponential,
     rotation_integrals,
     rotation_series,
-    skew,
 )
 
 
@@ -29,11 +28,6 @@ def test_integrals_are_those_of_the_matrix_exponential(angle: float) -> None:
     np.testing.assert_allclose(rotation_exponential(jnp.asarray(rotvec)), expected[:3, :3], atol=1e-14)
     np.testing.assert_allclose(first, expected[:3, 3:6], atol=1e-14)
     np.testing.assert_allclose(second, expected[:3, 6:], atol=1e-14)
-
-
-def test_skew_is_the_cross_product() -> None:
-    v, w = np.random.default_rng(0).normal(size=(2, 3))
-    np.testing.assert_allclose(skew(jnp.asarray(v)) @ w, np.cross(v, w))
 
 
 def test_the_series_holds_to_float32_up_to_its_limit() -> None:
