@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from lio_jax.sim.gps import GpsModel
     from lio_jax.sim.imu import ImuModel
     from lio_jax.sim.sequence import SimulatedSequence
+    from lio_jax.tuning.gradient import gradient
+    from lio_jax.tuning.objectives import MeanOverScans
 
 _HOMES = {
     "Config": "core.config",
@@ -44,6 +46,8 @@ _HOMES = {
     "GpsModel": "sim.gps",
     "ImuModel": "sim.imu",
     "SimulatedSequence": "sim.sequence",
+    "MeanOverScans": "tuning.objectives",
+    "gradient": "tuning.gradient",
 }
 
 __all__ = [
@@ -53,6 +57,7 @@ __all__ = [
     "ImuModel",
     "LidarScan",
     "LioJaxError",
+    "MeanOverScans",
     "Params",
     "RunResult",
     "Sequence",
@@ -63,6 +68,7 @@ __all__ = [
     "UsageError",
     "default_params",
     "evaluate",
+    "gradient",
     "imu_feed",
     "load_settings",
     "open_sequence",

@@ -17,6 +17,9 @@ Evaluate = Callable[[Vector], Evaluated]
 
 _LARGEST_STEP = 1.0
 """Of a component in one scoring step: a factor e of a positive parameter."""
+_LARGEST_SCALE = 300.0
+_DAMPING = 0.02
+"""Of the information's diagonal."""
 
 
 class Bounds(NamedTuple):
@@ -27,28 +30,34 @@ class Bounds(NamedTuple):
 
     def clip(self, x: Vector) -> Vector:
         """Return the nearest vector inside."""
-        return np.clip(x, self.lower, self.upper)
+        return np.asarray(np.clip(x, self.lower, self.upper), np.float64)
 
 
 def scoring(evaluate: Evaluate, x: Vector, bounds: Bounds, iterations: int) -> None:
     """Newton steps with the Fisher information from the scans' scores (Berndt, Hall, Hall & Hausman 1974).
 
-    Only for likelihoods. A damping of the information's diagonal grows when the gradient turns against the
-    last step, and falls otherwise.
+    Only for likelihoods. Far from the solution the scores' spread overstates the curvature by orders of
+    magnitude; the last two gradients tell by how much (Barzilai & Borwein 1988). Ends where the gradient is
+    within a tenth of its own standard deviation.
     """
-    damping, last_step = 0.02, None
+    scale, last = 1.0, None
     for _ in range(iterations):
         result = evaluate(x)
         information, gradient = fisher_information(result), result.gradient * result.scans
-        if last_step is not None:
-            damping = np.clip(damping * (4.0 if gradient @ last_step > 0 else 0.5), 0.02, 10.0)
-        damped = information + damping * np.diag(np.diag(information))
-        step = -np.linalg.solve(damped, gradient)
-        step *= min(1.0, _LARGEST_STEP / np.abs(step).max())
-        following = bounds.clip(x + step)
-        if np.abs(following - x).max() < 0.01:
+        if last is not None:
+            stride, before = last
+            curvature = stride @ (gradient - before)
+            measured = stride @ information @ stride / curvature if curvature > 0 else 2 * scale
+            scale = float(np.clip(measured, 0.5, _LARGEST_SCALE))
+        damped = information + _DAMPING * np.diag(np.diag(information))
+        step = np.asarray(-scale * np.linalg.solve(damped, gradient), np.float64)
+        step = step * min(1.0, _LARGEST_STEP / max(np.abs(step).max(), 1e-300))
+        step = np.asarray(bounds.clip(x + step) - x, np.float64)
+        free = np.abs(step) > 0
+        shift = gradient[free]
+        if not free.any() or shift @ np.linalg.solve(information[np.ix_(free, free)], shift) < 0.01:
             return
-        x, last_step = following, following - x
+        x, last = x + step, (step, gradient)
 
 
 def fisher_information(result: Evaluated) -> NDArray[np.float64]:

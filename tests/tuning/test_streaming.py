@@ -11,8 +11,10 @@ from lio_jax.recipes import RECIPES
 from lio_jax.run.track import CompiledStep, stepped
 from lio_jax.tuning.objective import Observed
 from lio_jax.tuning.parameters import free_parameters
+from lio_jax.tuning.reverse import CheckpointedGradient
 from lio_jax.tuning.streaming import StreamingGradient
-from tests.tuning.recordings import TIGHT, DoubleRecording, drive, settings
+from lio_jax.tuning.values import StreamingValues
+from tests.tuning.recordings import SCANS, TIGHT, DoubleRecording, drive, settings
 
 STEPS = {"imu.gyro_bias_walk": 1e-3, "imu.accel_bias_walk": 1e-3, "extrinsics": 1e-8}
 """Small where points move, lest they find another plane; large where hardly anything does."""
@@ -94,3 +96,33 @@ def test_gradients_of_every_leaf_agree_with_central_differences(recipe, inertial
         high, low = (total(HeldMap(chosen, free(end), nominal), recording) for end in ends)
         difference = (high - low) / (2 * step)
         assert result.gradient[component] == pytest.approx(difference, rel=1e-4, abs=1e-6), name
+
+
+FEW = ("imu.gyro_noise", "imu.accel_noise", "lidar.range_sigma", "extrinsics.*")
+
+
+def test_reverse_mode_and_a_batch_of_parameters_give_the_same_numbers():
+    chosen = settings("default", True, *TIGHT)
+    recording = DoubleRecording(drive(), chosen)
+    free = free_parameters(chosen.params(), FEW)
+    x = np.asarray(free.first())
+    programs = ("default", chosen.config, free, Everything())
+    streamed = StreamingGradient(*programs)(x, recording)
+    value, gradient = CheckpointedGradient(*programs)(x, recording, every=9)
+    assert value == pytest.approx(streamed.value, rel=1e-5)
+    np.testing.assert_allclose(gradient, streamed.gradient, rtol=1e-4)
+    np.testing.assert_allclose(streamed.scores.sum(0), streamed.gradient, rtol=1e-9)
+    assert streamed.scores.shape == (SCANS, len(x))
+
+    shifted = x + np.array([0.3, -0.2, 0.1, *np.zeros(7)])
+    alone = StreamingGradient(*programs)(shifted, recording).value
+    values = StreamingValues(*programs)(np.stack([x, shifted]), recording)
+    np.testing.assert_allclose(values, [streamed.value, alone], rtol=1e-4)
+
+
+def test_a_solve_that_does_not_converge_is_flagged():
+    chosen = settings("default", True, *TIGHT, "config.registration.max_iterations=2")
+    recording = DoubleRecording(drive(), chosen, 0, 6)
+    free = free_parameters(chosen.params(), ["imu.gyro_noise"])
+    result = StreamingGradient("default", chosen.config, free, Everything())(free.first(), recording)
+    assert result.unconverged == tuple(range(1, 6))

@@ -1,0 +1,92 @@
+"""``lio-jax tune`` from end to end on a small simulated recording."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import yaml
+
+from lio_jax.cli import main
+from lio_jax.commands.run import resolve_settings
+from lio_jax.data.native_writer import write_native
+from lio_jax.sim.imu import ImuModel
+from lio_jax.sim.sequence import SimulatedSequence
+
+SMALL = [
+    "--set",
+    "config.lidar.buckets=[4096]",
+    "config.imu.buckets=[64]",
+    "config.imu.registration_points=1024",
+    "config.imu.insertion_points=4096",
+    "config.map.capacity=32768",
+]
+PARAMS = ["--params", "imu.gyro_noise,lidar.range_sigma"]
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    """Return two native folders of 25 scans."""
+    paths = []
+    for seed in (1, 2):
+        sequence = SimulatedSequence(duration_s=2.5, beams=16, columns=256, seed=seed, imu=ImuModel())
+        paths.append(tmp_path_factory.mktemp("tune") / f"drive{seed}")
+        write_native(
+            paths[-1],
+            sequence.scans(),
+            T_imu_lidar=sequence.info.T_imu_lidar,
+            imu=sequence.imu(),
+            truth=sequence.truth(),
+        )
+    return [str(path) for path in paths]
+
+
+def test_a_tuning_leaves_settings_history_and_a_picture(recordings, tmp_path, capsys):
+    out = tmp_path / "out"
+    words = ["tune", recordings[0], *PARAMS, "--validate", recordings[1], "--out", str(out), *SMALL]
+    assert main([*words, "--iterations", "3"]) == 0
+    printed = capsys.readouterr().out
+    assert "imu.gyro_noise" in printed
+    assert "loss on validation" in printed
+    held = json.loads((out / "history.json").read_text())["iterates"]
+    assert len(held) == 3
+    assert held[-1]["value"] < held[0]["value"]
+    assert (out / "tuning.png").stat().st_size > 10_000
+
+    tree = yaml.safe_load((out / "tuned.yaml").read_text())
+    best = min(held, key=lambda one: one["validation"])
+    assert tree["params"]["imu"]["gyro_noise"] == pytest.approx(np.exp(best["x"][0]))
+    settings = resolve_settings(str(out / "tuned.yaml"), ())
+    assert settings.values["lidar"]["range_sigma"] == pytest.approx(np.exp(best["x"][1]))
+
+    assert main([*words, "--iterations", "4"]) == 0
+    assert "going on after 3 evaluations" in capsys.readouterr().err
+    assert len(json.loads((out / "history.json").read_text())["iterates"]) == 4
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        (["--params", "map.voxel_size"], ["map.voxel_size", "no derivative"]),
+        ([*PARAMS, "--objective", "truth"], ["'truth' is not known", "ate"]),
+        ([*PARAMS, "--objective", "ate", "--optimizer", "scoring"], ["scoring", "likelihood"]),
+        ([*PARAMS, "--segment", "5"], ["--segment", "20"]),
+        ([*PARAMS, "--iterations", "0"], ["--iterations", "1 or more"]),
+        ([*PARAMS, "--start", "99"], ["25 scans"]),
+    ],
+    ids=lambda value: " ".join(value[-2:]),
+)
+def test_wrong_usage_is_one_sentence(recordings, tmp_path, capsys, changed, words):
+    assert main(["tune", recordings[0], *changed, "--out", str(tmp_path / "out"), *SMALL]) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert all(word in error for word in words), error
+    assert not (tmp_path / "out" / "tuned.yaml").exists()
+
+
+def test_an_objective_against_truth_wants_truth(recordings, tmp_path, capsys):
+    blind = tmp_path / "blind"
+    shutil.copytree(recordings[0], blind)
+    (blind / "truth.tum").unlink()
+    status = main(["tune", str(blind), *PARAMS, "--objective", "ate", "--out", str(tmp_path / "out"), *SMALL])
+    assert status == 2
+    assert "holds no truth" in capsys.readouterr().err

@@ -1,0 +1,147 @@
+"""Optimisers and the session around them, on losses whose minimum is known."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from lio_jax.core.errors import LioJaxError
+from lio_jax.core.params import default_params
+from lio_jax.tuning.loss import Evaluated
+from lio_jax.tuning.optimise import Bounds, adam, fisher_information, lbfgsb, scoring
+from lio_jax.tuning.parameters import free_parameters
+from lio_jax.tuning.session import HISTORY, Session
+
+WIDE = Bounds(np.full(2, -20.0), np.full(2, 20.0))
+SAMPLES = np.random.default_rng(0).normal(0.0, [0.02, 3.0], (4000, 2))
+
+
+def noise_likelihood(x):
+    """Return the mean negative log-likelihood of zero-mean samples, x their log standard deviations."""
+    square = SAMPLES**2 * np.exp(-2 * np.asarray(x))
+    value = float(np.mean(np.sum(square / 2 + x, 1)))
+    scores = 1 - square
+    return Evaluated(value, scores.mean(0), scores, 0, len(SAMPLES))
+
+
+def visits(optimiser, *arguments, **named):
+    seen = []
+
+    def evaluate(x):
+        seen.append(np.array(x))
+        return noise_likelihood(x)
+
+    optimiser(evaluate, *arguments, **named)
+    return seen
+
+
+BEST = np.log(np.sqrt(np.mean(SAMPLES**2, 0)))
+
+
+@pytest.mark.parametrize("factor", [10.0, 0.1], ids=["too large", "too small"])
+@pytest.mark.parametrize("optimiser", [scoring, lbfgsb], ids=lambda f: f.__name__)
+def test_ten_times_wrong_densities_are_found(optimiser, factor):
+    reached = visits(optimiser, BEST + np.log(factor), WIDE, 60)
+    values = [noise_likelihood(x).value for x in reached]
+    np.testing.assert_allclose(reached[int(np.argmin(values))], BEST, atol=0.02)
+
+
+@pytest.mark.parametrize("optimiser", [scoring, lbfgsb], ids=lambda f: f.__name__)
+def test_bounds_hold(optimiser):
+    bounds = Bounds(BEST + 0.5, BEST + 3.0)
+    reached = visits(optimiser, BEST + 2.0, bounds, 60)
+    assert all(np.all((x >= bounds.lower - 1e-12) & (x <= bounds.upper + 1e-12)) for x in reached)
+    np.testing.assert_allclose(reached[-1], bounds.lower, atol=1e-6)
+
+
+def test_stochastic_steps_find_the_minimum():
+    random = np.random.default_rng(1)
+    reached = []
+
+    def segments():
+        while True:
+            rows = random.integers(len(SAMPLES), size=200)
+
+            def evaluate(x, rows=rows):
+                reached.append(np.array(x))
+                scores = 1 - SAMPLES[rows] ** 2 * np.exp(-2 * x)
+                return Evaluated(0.0, scores.mean(0), scores, 0, len(rows))
+
+            yield evaluate
+
+    adam(segments(), BEST + np.log(3.0), WIDE, 150)
+    np.testing.assert_allclose(reached[-1], BEST, atol=0.05)
+
+
+def test_the_fisher_information_gives_the_standard_deviation():
+    sigma = np.sqrt(np.diag(np.linalg.inv(fisher_information(noise_likelihood(BEST)))))
+    np.testing.assert_allclose(sigma, 1 / np.sqrt(2 * len(SAMPLES)), rtol=0.1)
+    drawn = multivariate_normal(np.zeros(2), np.diag(np.exp(2 * BEST))).rvs(
+        (300, 200), np.random.default_rng(2)
+    )
+    spread = np.std(np.log(np.sqrt(np.mean(drawn**2, 1))), 0)
+    np.testing.assert_allclose(sigma * np.sqrt(len(SAMPLES) / 200), spread, rtol=0.15)
+
+
+def test_a_parameter_without_effect_leaves_the_information_regular():
+    scores = np.random.default_rng(3).normal(size=(50, 2)) * [1.0, 0.0]
+    inverse = np.linalg.inv(fisher_information(Evaluated(0.0, scores.mean(0), scores, 0, 50)))
+    assert np.isfinite(inverse).all()
+
+
+FREE = free_parameters(default_params(), ["imu.gyro_noise", "lidar.range_sigma"])
+
+
+def session(folder, loss=None, patience=50, observer=lambda iterate: None):
+    evaluate = loss or (lambda x, recordings: noise_likelihood(x))
+    return Session(folder, FREE, evaluate, None, [None], [], True, patience, observer)
+
+
+def test_a_killed_tuning_goes_on_from_its_last_iterate(tmp_path):
+    class Killed(Exception):
+        pass
+
+    def kill(iterate):
+        if len(first.history) == 3:
+            raise Killed
+
+    first = session(tmp_path, observer=kill)
+    with pytest.raises(Killed):
+        first.run("scoring", BEST + 1.5, WIDE, 30, 0)
+    held = json.loads((tmp_path / HISTORY).read_text())
+    assert held["names"] == list(FREE.names)
+    assert len(held["iterates"]) == 3
+
+    second = session(tmp_path)
+    assert second.history == first.history
+    second.run("scoring", BEST + 1.5, WIDE, 30, 0)
+    np.testing.assert_array_equal(second.history[3].x, first.history[2].x)
+    np.testing.assert_allclose(second.best.x, BEST, atol=0.02)
+    assert len(second.history) <= 30
+
+
+def test_the_history_of_other_parameters_is_refused(tmp_path):
+    (tmp_path / HISTORY).write_text(json.dumps({"names": ["imu.accel_noise"], "iterates": []}))
+    with pytest.raises(LioJaxError, match=r"imu\.accel_noise.*--overwrite"):
+        session(tmp_path)
+
+
+def test_it_stops_when_nothing_gets_better(tmp_path):
+    def rising(x, recordings):
+        result = noise_likelihood(x)
+        return Evaluated(float(len(tuning.history)), result.gradient, result.scores, 0, len(SAMPLES))
+
+    tuning = session(tmp_path, rising, patience=4)
+    tuning.run("scoring", BEST + 5.0, WIDE, 30, 0)
+    assert len(tuning.history) == 5
+    assert tuning.best == tuning.history[0]
+
+
+def test_a_start_that_is_not_finite_is_refused(tmp_path):
+    def broken(x, recordings):
+        result = noise_likelihood(x)
+        return Evaluated(float("nan"), result.gradient, result.scores, 0, 10)
+
+    with pytest.raises(LioJaxError, match="not finite at the start"):
+        session(tmp_path, broken).run("scoring", BEST, WIDE, 5, 0)
