@@ -24,14 +24,27 @@ SMALL = [
     "config.imu.insertion_points=4096",
     "config.map.capacity=32768",
 ]
-TIGHT = ["params.registration.rotation_tolerance=1e-12", "params.registration.translation_tolerance=1e-12"]
+TIGHT = [
+    "config.registration.max_iterations=60",
+    "params.registration.rotation_tolerance=1e-12",
+    "params.registration.translation_tolerance=1e-12",
+]
 
 
 @cache
 def drive() -> SimulatedSequence:
     """Return a drive that has begun before the first scan."""
+    T_imu_lidar = np.eye(4)
+    # away from the borders of the map's grid
+    T_imu_lidar[:3, 3] = 0.06, 0.03, 0.25
     return SimulatedSequence(
-        duration_s=SCANS * 0.1, beams=16, columns=256, seed=3, imu=ImuModel(), moving_start=True
+        duration_s=SCANS * 0.1,
+        beams=16,
+        columns=256,
+        seed=3,
+        imu=ImuModel(),
+        moving_start=True,
+        T_imu_lidar=T_imu_lidar,
     )
 
 
