@@ -41,6 +41,10 @@ class PerShape:
         self.compile_s = 0.0
         """Time spent on tracing and compiling so far, s."""
 
+    def __len__(self) -> int:
+        """Return the number of programs compiled."""
+        return len(self._programs)
+
     def __call__(self, *arguments: Any) -> Any:
         """Run the program for these arguments."""
         key = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(arguments))

@@ -52,17 +52,17 @@ class CompiledStep:
         self._recipe = recipe = recipe_named(settings.recipe)
         self.config: Config = settings.config
         self.params: Params = settings.params()
-        self._init = PerShape(jax.jit(partial(recipe.init, self.config)))
-        self._step = PerShape(jax.jit(partial(recipe.step, self.config), donate_argnums=1))
+        self.init_programs = PerShape(jax.jit(partial(recipe.init, self.config)))
+        self.step_programs = PerShape(jax.jit(partial(recipe.step, self.config), donate_argnums=1))
 
     @property
     def compile_s(self) -> float:
         """Return the time spent on compiling so far, s."""
-        return self._init.compile_s + self._step.compile_s
+        return self.init_programs.compile_s + self.step_programs.compile_s
 
     def initial_state(self, imu: Any) -> Any:
         """Return the recipe's state before the first scan; ``imu``: samples up to its end, or None."""
-        return self._init(self.params, imu)
+        return self.init_programs(self.params, imu)
 
     def restarted(self, state: Any, imu: Any) -> Any:
         """Return the state before the first scan, with the velocity that ``state`` found."""
@@ -71,7 +71,7 @@ class CompiledStep:
 
     def __call__(self, state: Any, scan: Any, imu: Any) -> tuple[Any, Any]:
         """Run one step; ``state`` is consumed."""
-        return self._step(self.params, state, scan, imu)
+        return self.step_programs(self.params, state, scan, imu)
 
 
 def track(
