@@ -125,6 +125,8 @@ class _Search(eqx.Module):
             key = jax.lax.bitcast_convert_type(squared, jnp.int32) & distance_bits
             # queries side by side in memory: the network's loops run over them
             keys = materialised((key | (number * VOXELS + jnp.arange(VOXELS, dtype=jnp.int32))).T)
+            # in memory of its own: a loop that reads what it carries is not vectorised
+            nearest = materialised(nearest)
             for candidate in range(VOXELS):
                 nearest = _with_candidate(nearest, keys[candidate])
             return nearest
