@@ -124,7 +124,7 @@ def step(
     with jax.named_scope("update"):
         frame = Frame(*anchor_of(T_predicted.translation(), EDGE * params.map.voxel_size))
         scan_match = _ScanMatch(state.map, thin.points, thin.mask, frame, params, config.knn.neighbours)
-        update = update_nav(
+        update, matched = update_nav(
             prior,
             scan_match.measure,
             max_iterations=config.registration.max_iterations,
@@ -138,7 +138,7 @@ def step(
         T_world_lidar = lidar_pose(posterior.nav)
     with jax.named_scope("insert"):
         # the map is a constant of the derivative
-        _, placed = jax.lax.stop_gradient(frame.place(thin.points, T_world_lidar))
+        _, placed = jax.lax.stop_gradient(frame.place(thin.points, lidar_pose(matched)))
         side = params.point_map.cube_side_length
         margin = params.point_map.cube_margin * params.lidar.max_range
         in_blocks = jnp.stack([side / 2, margin]).astype(jnp.float32) / (EDGE * voxel_size)

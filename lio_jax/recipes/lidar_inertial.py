@@ -90,7 +90,7 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
     with jax.named_scope("update"):
         frame = Frame(*anchor_of(T_predicted.translation(), params.map.voxel_size))
         scan_match = _ScanMatch(state.map, to_match, thin.matched.mask, frame, state.prediction_error, params)
-        update = update_nav(
+        update, matched = update_nav(
             prior,
             scan_match.measure,
             max_iterations=config.registration.max_iterations,
@@ -101,14 +101,14 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
         )
         posterior: Uncertain = update.state
         lost = (update.status > ITERATION_LIMIT) & ~first
-        T_world_lidar = lidar_pose(posterior.nav)
+        T_world_lidar, T_matched = lidar_pose(posterior.nav), lidar_pose(matched)
         matches = update.measurement.aux.association.found
-        evidence = point_evidence(matches, to_match, T_world_lidar, frame, params)
-        missed = jnp.linalg.norm((T_predicted.inverse() @ T_world_lidar).translation())
+        evidence = point_evidence(matches, to_match, T_matched, frame, params)
+        missed = jnp.linalg.norm((T_predicted.inverse() @ T_matched).translation())
         error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
     with jax.named_scope("insert"):
         # the map is a constant of the derivative
-        _, placed = jax.lax.stop_gradient(frame.place(points, T_world_lidar))
+        _, placed = jax.lax.stop_gradient(frame.place(points, T_matched))
         vmap, added = insert(
             state.map,
             placed,
