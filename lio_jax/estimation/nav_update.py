@@ -57,7 +57,9 @@ class _State(NamedTuple):
     def reset(self, error: Float[Array, "30"]) -> Float[Array, "30 30"]:
         """Return :func:`reset_jacobian` for all of it."""
         nav, lag = slice(0, DOF), jnp.eye(self.lag.shape[0], dtype=self.lag.dtype)
-        return from_blocks((LAG.stop, LAG.stop), (nav, nav, reset_jacobian(self.nav, error)), (LAG, LAG, lag))
+        return from_blocks(
+            (LAG.stop, LAG.stop), (nav, nav, reset_jacobian(self.nav, error[:DOF])), (LAG, LAG, lag)
+        )
 
 
 class _AtMean(eqx.Module):

@@ -114,7 +114,8 @@ def step(
             prior, path = predicted_without_samples(params, state.uncertain, state.rate, scan, first)
         else:
             to_end = jnp.zeros_like(state.to_end)
-            prior, path = predicted(params, state.uncertain, scan, imu, first)
+            # as FAST-LIO2 does, the match is taken for one of the pose at the scan's end
+            prior, path = predicted(params, state.uncertain, scan, imu, first, sweep_start=scan.duration)
         T_predicted = lidar_pose(prior.nav)
     with jax.named_scope("thin"):
         points, time, in_range = _filtered(config.fast_lio2.point_filter_num, params, scan)
@@ -124,7 +125,7 @@ def step(
     with jax.named_scope("update"):
         frame = Frame(*anchor_of(T_predicted.translation(), EDGE * params.map.voxel_size))
         scan_match = _ScanMatch(state.map, thin.points, thin.mask, frame, params, config.knn.neighbours)
-        update, matched = update_nav(
+        update, _ = update_nav(
             prior,
             scan_match.measure,
             max_iterations=config.registration.max_iterations,
@@ -138,7 +139,7 @@ def step(
         T_world_lidar = lidar_pose(posterior.nav)
     with jax.named_scope("insert"):
         # the map is a constant of the derivative
-        _, placed = jax.lax.stop_gradient(frame.place(thin.points, lidar_pose(matched)))
+        _, placed = jax.lax.stop_gradient(frame.place(thin.points, T_world_lidar))
         side = params.point_map.cube_side_length
         margin = params.point_map.cube_margin * params.lidar.max_range
         in_blocks = jnp.stack([side / 2, margin]).astype(jnp.float32) / (EDGE * voxel_size)
