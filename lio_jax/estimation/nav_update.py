@@ -20,7 +20,7 @@ from lio_jax.core.error_state import (
     TIME_OFFSET,
     VELOCITY,
     Swept,
-    local,
+    Uncertain,
     retract,
     sphere_basis,
 )
@@ -31,35 +31,40 @@ from lio_jax.imu.rotation_integrals import rotation_exponential, rotation_integr
 
 
 class _State(NamedTuple):
-    """A navigation state at a sweep's end and how far its pose is ahead of the sweep's mean."""
+    """A prediction and the error that it is found to have: all iterates live in one tangent space."""
 
-    nav: NavState
-    lag: Float[Array, "6"]
-    """Rotation (rad) and position (m), IMU frame."""
+    predicted: NavState
+    error: Float[Array, "30"]
+    """As in :class:`Swept`."""
+
+    def end(self) -> NavState:
+        """Return the state at the sweep's end."""
+        return retract(self.predicted, self.error[:DOF])
 
     def mean(self) -> NavState:
         """Return the state with the sweep's mean pose."""
-        return retract(self.nav, jnp.pad(-self.lag, (0, DOF - self.lag.shape[0])))
+        return retract(self.predicted, self._mean_error())
 
     def jacobian(self) -> Float[Array, "6 30"]:
-        """Return the derivative of the mean lidar pose by the error and the lag, to the lag's first order."""
-        by_error = lidar_pose_jacobian(self.mean())
-        return jnp.concatenate([by_error, -by_error[:, : POSITION.stop]], axis=1)
+        """Return the derivative of the mean lidar pose by the error."""
+        by_mean = lidar_pose_jacobian(self.mean()) @ reset_jacobian(self.predicted, self._mean_error())
+        return jnp.concatenate([by_mean, -by_mean[:, : POSITION.stop]], axis=1)
 
-    def retract(self, error: Float[Array, "30"]) -> "_State":
+    def add(self, error: Float[Array, "30"]) -> "_State":
         """Return the state with the error added."""
-        return _State(retract(self.nav, error[:DOF]), self.lag + error[LAG])
+        return _State(self.predicted, self.error + error)
 
-    def local(self, other: "_State") -> Float[Array, "30"]:
+    def subtract(self, other: "_State") -> Float[Array, "30"]:
         """Return the error by which the other differs."""
-        return jnp.concatenate([local(self.nav, other.nav), other.lag - self.lag])
+        return other.error - self.error
 
     def reset(self, error: Float[Array, "30"]) -> Float[Array, "30 30"]:
-        """Return :func:`reset_jacobian` for all of it."""
-        nav, lag = slice(0, DOF), jnp.eye(self.lag.shape[0], dtype=self.lag.dtype)
-        return from_blocks(
-            (LAG.stop, LAG.stop), (nav, nav, reset_jacobian(self.nav, error[:DOF])), (LAG, LAG, lag)
-        )
+        """Return the change of tangent space by the error: none."""
+        return jnp.eye(error.shape[0], dtype=error.dtype)
+
+    def _mean_error(self) -> Float[Array, "24"]:
+        lag = self.error[LAG]
+        return self.error[:DOF] - jnp.pad(lag, (0, DOF - lag.shape[0]))
 
 
 class _AtMean(eqx.Module):
@@ -73,7 +78,7 @@ class _AtMean(eqx.Module):
 
 def predicted_pose_covariance(prior: Swept) -> Float[Array, "6 6"]:
     """Return the covariance of the mean lidar pose over a sweep, perturbed as in the update."""
-    jacobian = _at_mean(prior).jacobian()
+    jacobian = _unchanged(prior).jacobian()
     return jacobian @ prior.covariance @ jacobian.T
 
 
@@ -110,12 +115,12 @@ def update_nav(
     tolerance = jnp.full(LAG.stop, jnp.inf, dtype)
     tolerance = tolerance.at[ROTATION].set(rotation_tolerance).at[POSITION].set(translation_tolerance)
     update = iterated_update(
-        _at_mean(prior),
+        _unchanged(prior),
         prior.covariance,
         _AtMean(measure),
         _State.jacobian,
-        _State.retract,
-        _State.local,
+        _State.add,
+        _State.subtract,
         max_iterations=max_iterations,
         tolerance=tolerance,
         first_aux=first_aux,
@@ -123,12 +128,14 @@ def update_nav(
         reset=_State.reset,
     )
     found: _State = update.state
-    end = Swept(found.nav, update.covariance).at_end()
+    turn = reset_jacobian(prior.nav, found.error[:DOF])
+    covariance = turn @ update.covariance[:DOF, :DOF] @ turn.T
+    end = Uncertain(found.end(), (covariance + covariance.T) / 2)
     return update._replace(state=end, covariance=end.covariance), found.mean()
 
 
-def _at_mean(prior: Swept) -> _State:
-    return _State(prior.nav, jnp.zeros(LAG.stop - LAG.start, prior.covariance.dtype))
+def _unchanged(prior: Swept) -> _State:
+    return _State(prior.nav, jnp.zeros(prior.covariance.shape[0], prior.covariance.dtype))
 
 
 def reset_jacobian(nav: NavState, error: Float[Array, "24"]) -> Float[Array, "24 24"]:

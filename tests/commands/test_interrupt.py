@@ -18,7 +18,6 @@ from lio_jax.data.trajectory import read_tum
 from tests.commands.test_run_folder import FILES
 from tests.run.small_drive import COUNT, PERIOD_NS, Replay, moving, shifted, standing, write_folder
 
-
 SCANS = 4000
 """So many that they take seconds: an interrupt long after the first one still comes before the last."""
 
