@@ -235,7 +235,7 @@ class _ScanMatch(eqx.Module):
         settings = self.params.registration
         equations = linearise(association.found, self.points, lidar_pose(nav), self.frame, self.params)
         information, gradient, degenerate = keep_observed(
-            equations.hessian, equations.gradient, equations.arm_squared, settings.degeneracy_ratio
+            equations.hessian, equations.gradient, equations.arm_squared, settings.inertial_degeneracy_ratio
         )
         return Measurement(
             information=settings.information_scale * information,

@@ -203,7 +203,7 @@ class _ScanMatch(eqx.Module):
             self.params,
         )
         information, gradient, degenerate = keep_observed(
-            equations.hessian, equations.gradient, equations.arm_squared, settings.degeneracy_ratio
+            equations.hessian, equations.gradient, equations.arm_squared, settings.inertial_degeneracy_ratio
         )
         return Measurement(
             information=settings.information_scale * information,
