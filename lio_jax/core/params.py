@@ -99,7 +99,7 @@ class RegistrationParams(eqx.Module):
     degeneracy_ratio: Scalar
     """A direction with less than this fraction of the strongest direction's information is degenerate."""
     inertial_degeneracy_ratio: Scalar
-    """The same in a filter, whose prediction has a covariance: that weighs what little is known, such as a few
+    """The same in a filter, whose prediction has a covariance: it weighs what little is known, such as a few
     trees on a plain, against what a map's roughness feigns."""
     min_matches: Scalar
     """Matched points below which a scan counts as lost."""
