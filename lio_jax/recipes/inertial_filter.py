@@ -1,5 +1,7 @@
 """What the recipes with an error-state filter share: the start, the prediction and the form of the result."""
 
+from typing import Any, Protocol, runtime_checkable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,6 +9,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from lio_jax.core.blocks import from_blocks
+from lio_jax.core.config import Config
 from lio_jax.core.error_state import (
     DOF,
     EXTRINSIC_ROTATION,
@@ -21,8 +24,8 @@ from lio_jax.core.error_state import (
 from lio_jax.core.params import Params
 from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.core.types import ImuBatch, NavState, Scan
-from lio_jax.estimation.iterated_filter import Update
-from lio_jax.estimation.nav_update import predicted_pose_covariance
+from lio_jax.estimation.iterated_filter import Measurement, Update
+from lio_jax.estimation.nav_update import predicted_pose_covariance, update_nav
 from lio_jax.imu.initialise import initialise_at_rest
 from lio_jax.imu.path import Path
 from lio_jax.imu.strapdown import propagate_sweep
@@ -94,6 +97,42 @@ def predicted(
     moved, path = propagate_sweep(last, imu, params.imu, start, end, jnp.asarray(sweep_start, dtype))
     # the first scan's end is the world's origin: its samples only deskew it
     return jax.tree.map(lambda new, old: jnp.where(first, old, new), moved, Swept.at_once(last)), path
+
+
+@runtime_checkable
+class ScanMatch(Protocol):
+    """A scan against a map, as a measurement of the lidar's pose; a pytree."""
+
+    def measure(self, nav: NavState, last: Any) -> Measurement:
+        """Match and linearise at a state, given what the last linearisation left."""
+        ...
+
+    def again(self, nav: NavState, last: Any) -> Measurement:
+        """Linearise at a state with the choices of the last linearisation."""
+        ...
+
+
+def corrected(
+    config: Config, params: Params, prior: Swept, scan_match: ScanMatch, before: Any
+) -> tuple[Update, NavState]:
+    """Return the update by a scan match, and the state with the pose at which the scan lies on the map.
+
+    Args:
+        config: static.
+        params: traced.
+        prior: predicted state.
+        scan_match: the measurement.
+        before: what its first linearisation starts from.
+    """
+    return update_nav(
+        prior,
+        scan_match.measure,
+        max_iterations=config.registration.max_iterations,
+        rotation_tolerance=params.registration.rotation_tolerance,
+        translation_tolerance=params.registration.translation_tolerance,
+        first_aux=before,
+        again=scan_match.again,
+    )
 
 
 def lidar_pose(nav: NavState) -> jaxlie.SE3:

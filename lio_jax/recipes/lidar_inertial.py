@@ -16,13 +16,13 @@ from lio_jax.core.implicit import known
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
-from lio_jax.estimation.nav_update import update_nav
 from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.imu.path import Path, deskew_along
 from lio_jax.lidar.thinning import ThinnedScan, thinned
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
 from lio_jax.recipes.inertial_filter import (
     Linearised,
+    corrected,
     evidence_of,
     levelled_start,
     lidar_pose,
@@ -90,15 +90,7 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
     with jax.named_scope("update"):
         frame = Frame(*anchor_of(T_predicted.translation(), params.map.voxel_size))
         scan_match = _ScanMatch(state.map, to_match, thin.matched.mask, frame, state.prediction_error, params)
-        update, matched = update_nav(
-            prior,
-            scan_match.measure,
-            max_iterations=config.registration.max_iterations,
-            rotation_tolerance=params.registration.rotation_tolerance,
-            translation_tolerance=params.registration.translation_tolerance,
-            first_aux=scan_match.before(T_predicted),
-            again=scan_match.again,
-        )
+        update, matched = corrected(config, params, prior, scan_match, scan_match.before(T_predicted))
         posterior: Uncertain = update.state
         lost = (update.status > ITERATION_LIMIT) & ~first
         T_world_lidar, T_matched = lidar_pose(posterior.nav), lidar_pose(matched)
