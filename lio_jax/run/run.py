@@ -27,6 +27,7 @@ from lio_jax.run.imu_rate import write_imu_rate
 from lio_jax.run.keyframes import keyframe_indices, odometry_edges
 from lio_jax.run.map_file import MapFile
 from lio_jax.run.overflow import Overflow
+from lio_jax.run.surroundings import fitted_to_surroundings
 from lio_jax.run.track import CompiledStep, Tracked, track
 from lio_jax.run.trajectory_log import TrajectoryLog
 
@@ -57,17 +58,23 @@ class RunResult:
 
 
 def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list[str]]:
-    """Take T_imu_lidar from the recording's calibration unless it was given; say where it came from."""
+    """Take from the recording what was not given: T_imu_lidar, the voxels' size; say what came from where."""
+    settings, calibration = _calibrated(sequence, settings)
+    settings, fitted = fitted_to_surroundings(sequence, settings)
+    return settings, [calibration, *fitted]
+
+
+def _calibrated(sequence: Sequence, settings: Settings) -> tuple[Settings, str]:
     given = any(
         path.startswith(("params.extrinsics.rot", "params.extrinsics.trans")) for path in settings.given
     )
     if given:
         unused = "" if sequence.info.T_imu_lidar is None else "; the recording's calibration is not used"
-        return settings, [f"T_imu_lidar: as given in the settings{unused}."]
+        return settings, f"T_imu_lidar: as given in the settings{unused}."
     if sequence.info.T_imu_lidar is None:
-        return settings, ["T_imu_lidar: not in the recording; taken as identity (set params.extrinsics.*)."]
+        return settings, "T_imu_lidar: not in the recording; taken as identity (set params.extrinsics.*)."
     settings = with_extrinsics(settings, sequence.info.T_imu_lidar, sequence.info.path)
-    return settings, ["T_imu_lidar: from the recording's calibration."]
+    return settings, "T_imu_lidar: from the recording's calibration."
 
 
 def run_sequence(

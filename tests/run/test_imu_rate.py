@@ -46,9 +46,11 @@ def test_poses_between_scans_agree_with_the_truth(run: Path, at_samples: Traject
     assert len(between) > 250
     # measured: 0.009 m
     assert errors(between, at_ends).max() < 0.02
-    # from sample to sample the largest step is a scan's correction: 0.002 m measured
+    # from sample to sample the largest step is a scan's correction: 0.002 m measured, 0.006 m in the first
+    # scans, whose mean poses alone tell the velocity that leads to their ends
+    known = at_samples.stamp_ns > at_ends.stamp_ns[3]
     truth = drive().truth().at(at_samples.stamp_ns).poses
-    steps = [np.linalg.inv(poses[:-1]) @ poses[1:] for poses in (truth, at_samples.poses)]
+    steps = [np.linalg.inv(poses[known][:-1]) @ poses[known][1:] for poses in (truth, at_samples.poses)]
     assert np.linalg.norm((steps[0] - steps[1])[:, :3, 3], axis=1).max() < 0.005
 
 
