@@ -218,7 +218,7 @@ def tables(objective: str, options: argparse.Namespace) -> dict[str, Any]:
     names = [name.split(".")[1] for name in shop.free.names]
     true = np.array([np.log(TRUE.get(name, 1.0)) for name in shop.free.names])
     print(f"\nobjective {objective}: found / true [95 % interval]; information_scale as it is")
-    print(f"{'world':8}{'seed':>5}{'start':>7}" + "".join(f"{name:>26}" for name in names) + f"{'s':>7}")
+    print(f"{'world':8}{'seed':>5}{'start':>7}" + "".join(f"{name:>28}" for name in names) + f"{'s':>7}")
     found: list[Found] = []
     rows: list[dict[str, Any]] = []
     for world in options.worlds:
@@ -226,9 +226,11 @@ def tables(objective: str, options: argparse.Namespace) -> dict[str, Any]:
             for factor in options.factors:
                 began = time.perf_counter()
                 one = shop.tuned(world, seed, factor, options.iterations)
-                low, middle, high = (np.exp(one.x - true + width * one.sigma) for width in (-1.96, 0, 1.96))
+                # a walk that nothing is known of has no upper end
+                with np.errstate(over="ignore"):
+                    low, middle, high = (np.exp(one.x - true + k * one.sigma) for k in (-1.96, 0, 1.96))
                 cells = (f"{m:.3g} [{a:.2g}, {b:.2g}]" for a, m, b in zip(low, middle, high, strict=True))
-                line = "".join(f"{cell:>26}" for cell in cells)
+                line = "".join(f"{cell:>28}" for cell in cells)
                 print(f"{world:8}{seed:5d}{factor:7g}{line}{time.perf_counter() - began:7.0f}", flush=True)
                 found.append(one)
                 rows.append({"world": world, "seed": seed, "factor": factor, "ratio": middle.tolist()})
