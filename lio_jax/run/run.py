@@ -27,6 +27,7 @@ from lio_jax.run.imu_rate import write_imu_rate
 from lio_jax.run.keyframes import keyframe_indices, odometry_edges
 from lio_jax.run.map_file import MapFile
 from lio_jax.run.overflow import Overflow
+from lio_jax.run.sensor_sizes import with_sensor_sizes
 from lio_jax.run.track import CompiledStep, Tracked, track
 from lio_jax.run.trajectory_log import TrajectoryLog
 
@@ -57,7 +58,13 @@ class RunResult:
 
 
 def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list[str]]:
-    """Take T_imu_lidar from the recording's calibration unless it was given; say where it came from."""
+    """Take what the settings leave open from the recording, T_imu_lidar and the features' sizes; say so."""
+    settings, said = with_sensor_sizes(settings, sequence.scans())
+    settings, where_from = _with_calibration(sequence, settings)
+    return settings, [*where_from, *said]
+
+
+def _with_calibration(sequence: Sequence, settings: Settings) -> tuple[Settings, list[str]]:
     given = any(
         path.startswith(("params.extrinsics.rot", "params.extrinsics.trans")) for path in settings.given
     )
