@@ -135,6 +135,8 @@ class LoamConfig:
     rounds: int = 2
     """How often a scan's matches are searched; each time ``config.registration.max_iterations`` steps follow
     at most."""
+    opening_rounds: int = 15
+    """Takes the place of ``rounds`` between the first two scans: no velocity is known there."""
     compensate: bool = True
     """Compensate the motion within a scan, as the pose under trial implies it."""
     mapping_every: int = 1

@@ -135,7 +135,7 @@ def step(
         prediction = jaxlie.SE3.exp(elapsed * state.twist)
         odometry = match_in_rounds(
             ScanToScan(last=state.map.last, compensated=picks, T_predicted=prediction, params=params),
-            config.loam.rounds,
+            jnp.where(state.scans == 1, jnp.int32(config.loam.opening_rounds), jnp.int32(config.loam.rounds)),
             config.registration.max_iterations,
         )
         T_odom_lidar = state.T_odom_lidar @ odometry.T_world_lidar

@@ -4,7 +4,6 @@ Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014, sectio
 """
 
 import abc
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -60,7 +59,7 @@ class Task(eqx.Module):
         return linearise(matches, points, T_target_lidar, self.frames(), weight, params.lidar.range_sigma)
 
 
-def match_in_rounds(task: Task, rounds: int, max_iterations: int) -> Registration:
+def match_in_rounds(task: Task, rounds: int | Int32[Array, ""], max_iterations: int) -> Registration:
     """Find the pose at which the points fit their lines and planes best, by Huber's measure.
 
     Directions the matches do not constrain keep the prediction (Zhang & Singh, "On degeneracy of
@@ -76,9 +75,12 @@ def match_in_rounds(task: Task, rounds: int, max_iterations: int) -> Registratio
         max_iterations: Gauss-Newton steps at most after each search.
     """
     problem = Problem(
-        partial(_solve, rounds, max_iterations), _again, _missed, lambda step, equations, end, task: equations
+        lambda inputs: _solve(max_iterations, *inputs),
+        lambda step, end, inputs: _again(step, end, inputs[1]),
+        lambda step, equations, end, inputs: _missed(step, equations, end, inputs[1]),
+        lambda step, equations, end, inputs: equations,
     )
-    step, end, equations = implicit(problem, task)
+    step, end, equations = implicit(problem, (jnp.asarray(rounds, jnp.int32), task))
     return registration_at(
         moved(end.T_target_lidar, step),
         task.T_predicted,
@@ -101,7 +103,7 @@ class _End(eqx.Module):
     """Of the last step."""
 
 
-def _solve(rounds: int, max_iterations: int, task: Task) -> Solution:
+def _solve(max_iterations: int, rounds: Int32[Array, ""], task: Task) -> Solution:
     settings = task.params.registration
 
     def one_round(_: Array, carry: tuple[_End, NormalEquations]) -> tuple[_End, NormalEquations]:
