@@ -49,7 +49,7 @@ RECIPE_VALUES: dict[str, dict[str, Any]] = {
         "params.map.voxel_size": 0.8,
         "params.map.corner_voxel_size": 0.4,
         "params.registration.kernel": 0.1,
-        "params.registration.reassociation_distance": 0.01,
+        "params.registration.reassociation_distance": 0.05,
         "params.registration.rotation_tolerance": 1e-3,
         "params.registration.translation_tolerance": 1e-3,
         "params.registration.degeneracy_ratio": 1e-4,

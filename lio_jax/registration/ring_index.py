@@ -1,12 +1,12 @@
 """The points of one scan nearest another's, ring by ring: exact, and quick because rings are sorted.
 
 Points are sorted by ring and by azimuth within each ring. A query looks at a window of each ring near its own
-elevation; where what lies outside might be nearer, at a longer window of every ring; and where even that is
-not sure, at all points.
+elevation; where what lies outside might be nearer, at longer windows of more rings; and where even that is
+not sure, at all points. Several clouds share an index, each with rings of its own.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -18,12 +18,14 @@ from lio_jax.core.materialise import materialised
 from lio_jax.core.prefix_sum import running_count
 from lio_jax.lidar.range_image import azimuth
 
-_SIDE, _NARROW = 8, 16
+_SIDE, _NARROW = 8, 24
 """Rings above and below a query's own, and points of each, that are looked at for the nearest point."""
-_BESIDE, _WIDE = 2, 64
-"""Likewise for the others: at LOAM's spacing of 0.2 m they reach beyond its search radius of 5 m."""
-_CHUNK = 32
-"""Queries that look farther at a time."""
+_BESIDE, _WIDE = 2, 32
+"""Likewise for the next ones, around the nearest one's ring."""
+_CHUNK, _FARTHER_NARROW, _FARTHER_WIDE = 32, 32, 256
+"""Queries that look farther at a time, and the points of each ring that they look at."""
+_LAST_CHUNK = 8
+"""Queries that look at all points at a time."""
 _SECTORS = 512
 """Parts of a ring that it is sorted into: few, so that a number of 32 bits holds ring, sector and row."""
 _QUARTER = np.float32(np.pi / 2)
@@ -33,7 +35,7 @@ _Points = tuple[Float32[Array, " k"], Float32[Array, " k"], Float32[Array, " k"]
 
 
 class RingIndex(eqx.Module):
-    """A cloud sorted for the search; masked points come last."""
+    """Clouds sorted for the search; masked points come last."""
 
     x: Float32[Array, " m"]
     """m."""
@@ -58,6 +60,22 @@ class RingIndex(eqx.Module):
         return _take(self.x, place), _take(self.y, place), _take(self.z, place)
 
 
+class Queries(eqx.Module):
+    """Points whose neighbours are sought."""
+
+    x: Float32[Array, " k"]
+    """m, in the index's frame."""
+    y: Float32[Array, " k"]
+    z: Float32[Array, " k"]
+    lowest: Int32[Array, " k"]
+    """First ring of the cloud to search."""
+
+    def away_from(self, points: tuple[Array, Array, Array]) -> Array:
+        """Return squared distances, m^2."""
+        x, y, z = points
+        return (x - self.x) ** 2 + (y - self.y) ** 2 + (z - self.z) ** 2
+
+
 class Nearest(eqx.Module):
     """Places of points in an index, -1 where there is none within the radius."""
 
@@ -71,21 +89,20 @@ class Nearest(eqx.Module):
 def ring_index(
     points: Float32[Array, "m 3"], ring: Int32[Array, " m"], mask: Bool[Array, " m"], rings: int
 ) -> RingIndex:
-    """Sort a cloud.
+    """Sort clouds.
 
     Args:
         points: m.
         ring: of each point.
         mask: which points are real.
-        rings: number of rings.
+        rings: number of rings, of all clouds together.
     """
     count = len(points)
     row_bits = (count - 1).bit_length()
     sectors = min(_SECTORS, 1 << (((1 << (32 - row_bits)) - 1) // rings).bit_length() - 1)
     x, y, z = materialised(tuple(points.T))
     angle = azimuth(x, y)
-    sector = jnp.clip(_sector(angle, sectors), 0, sectors - 1)
-    cell = jnp.where(mask, ring * sectors + sector, rings * sectors)
+    cell = jnp.where(mask, ring * sectors + _sector(angle, sectors), rings * sectors)
     row = jnp.arange(count, dtype=jnp.uint32)
     # numbers without a payload are sorted four times as fast as an argsort
     key = jnp.sort(cell.astype(jnp.uint32) << row_bits | row)
@@ -94,10 +111,8 @@ def ring_index(
     first = jnp.cumsum(occupied, dtype=jnp.int32) - occupied
 
     elevation = azimuth(jnp.sqrt(x**2 + y**2), z)
-    total = jnp.zeros((rings, 2), jnp.float32)
-    total = total.at[jnp.where(mask, ring, rings)].add(
-        jnp.stack([elevation, jnp.ones_like(elevation)], -1), mode="drop"
-    )
+    terms = jnp.stack([elevation, jnp.ones_like(elevation)], -1)
+    total = jnp.zeros((rings, 2), jnp.float32).at[jnp.where(mask, ring, rings)].add(terms, mode="drop")
     mean = jnp.where(total[:, 1] > 0, total[:, 0] / jnp.maximum(total[:, 1], 1.0), jnp.inf)
     x, y, z, angle, ring, mask = (_take(column, order) for column in (x, y, z, angle, ring, mask))
     return RingIndex(x, y, z, jnp.where(mask, ring, -1), angle, first, mean)
@@ -105,53 +120,65 @@ def ring_index(
 
 def nearest_by_ring(
     index: RingIndex,
-    points: Float32[Array, "k 3"],
+    queries: Queries,
     mask: Bool[Array, " k"],
+    cloud_rings: int,
     radius: Float32[Array, ""],
     rings_apart: Float32[Array, ""],
 ) -> Nearest:
     """Return, for each query, the nearest point, the next one of its ring and the nearest of another ring.
 
     Args:
-        index: of the cloud to search.
-        points: queries, in the cloud's frame, m.
+        index: of the clouds to search.
+        queries: finite, also where masked.
         mask: which queries are real.
+        cloud_rings: number of rings of each cloud.
         radius: farther points do not count, m.
-        rings_apart: the other ring is fewer rings than this away from the nearest point's.
+        rings_apart: the other ring is fewer rings than this away from the nearest point's; 3 at most.
     """
-    rings = len(index.elevation)
-    queries: _Points = materialised(tuple(jnp.where(mask[:, None], points, 0.0).T))
-    search = _Search(index, radius, rings_apart)
-    found, sure = search.in_windows(queries, _SIDE, _NARROW)
+    search = _Search(index, radius, rings_apart, cloud_rings)
+    nearest, sure = search.nearest(queries, _SIDE, _NARROW)
+    nearest, sure = _again(
+        mask & ~sure,
+        queries,
+        nearest,
+        lambda some: search.nearest(some, cloud_rings, _FARTHER_NARROW),
+    )
+    nearest, _ = _again(mask & ~sure, queries, nearest, search.nearest_of_all, _LAST_CHUNK)
+    beside, sure = search.beside((queries, nearest), _WIDE)
+    given = queries, nearest
+    beside, sure = _again(mask & ~sure, given, beside, lambda some: search.beside(some, _FARTHER_WIDE))
+    beside, _ = _again(mask & ~sure, given, beside, search.beside_of_all, _LAST_CHUNK)
+    return Nearest(*(jnp.where(mask, place, -1) for place in (nearest, *beside)))
 
-    def among_all(queries: _Points) -> tuple[Nearest, Array]:
-        return search.among_all(queries), jnp.ones_like(queries[0], bool)
 
-    found, sure = _again(mask & ~sure, queries, found, lambda some: search.in_windows(some, rings, _WIDE))
-    found, _ = _again(mask & ~sure, queries, found, among_all)
-    return jax.tree.map(lambda place: jnp.where(mask, place, -1), found)
+_Given = TypeVar("_Given")
+_Found = TypeVar("_Found")
 
 
 def _again(
     unsure: Bool[Array, " k"],
-    queries: _Points,
-    found: Nearest,
-    search: Callable[[_Points], tuple[Nearest, Bool[Array, " c"]]],
-) -> tuple[Nearest, Bool[Array, " k"]]:
-    """Search anew for some of the queries, chunk by chunk; tell for which one is sure then."""
+    given: _Given,
+    found: _Found,
+    search: Callable[[_Given], tuple[_Found, Bool[Array, " c"]]],
+    chunk: int = _CHUNK,
+) -> tuple[_Found, Bool[Array, " k"]]:
+    """Search anew for some of the queries, chunk by chunk; tell for which ones the result is sure then."""
     count = len(unsure)
     rank = running_count(unsure) - 1
     order = jnp.arange(count, dtype=jnp.int32)
     waiting = jnp.full(count, count, jnp.int32).at[jnp.where(unsure, rank, count)].set(order, mode="drop")
 
-    def one_chunk(number: Array, carry: tuple[Nearest, Array]) -> tuple[Nearest, Array]:
-        place = number * _CHUNK + jnp.arange(_CHUNK, dtype=jnp.int32)
+    def one_chunk(number: Array, carry: tuple[_Found, Array]) -> tuple[_Found, Array]:
+        place = number * chunk + jnp.arange(chunk, dtype=jnp.int32)
         row = waiting.at[place].get(mode="fill", fill_value=count)
-        x, y, z = (axis.at[row].get(mode="clip") for axis in queries)
-        new = search((x, y, z))
-        return jax.tree.map(lambda old, some: old.at[row].set(some, mode="drop"), carry, new)
+        new = search(jax.tree.map(lambda column: column.at[row].get(mode="clip"), given))
+        merged: tuple[_Found, Array] = jax.tree.map(
+            lambda old, some: old.at[row].set(some, mode="drop"), carry, new
+        )
+        return merged
 
-    return jax.lax.fori_loop(0, (rank[-1] + _CHUNK) // _CHUNK, one_chunk, (found, ~unsure))
+    return jax.lax.fori_loop(0, (rank[-1] + chunk) // chunk, one_chunk, (found, ~unsure))
 
 
 class _Search(eqx.Module):
@@ -160,106 +187,129 @@ class _Search(eqx.Module):
     index: RingIndex
     radius: Float32[Array, ""]
     rings_apart: Float32[Array, ""]
+    cloud_rings: int = eqx.field(static=True)
 
-    def in_windows(self, queries: _Points, side: int, window: int) -> tuple[Nearest, Bool[Array, " k"]]:
-        """Search windows of near rings; tell for which queries nothing outside of them can be nearer.
+    def nearest(self, queries: Queries, side: int, window: int) -> tuple[Array, Bool[Array, " k"]]:
+        """Return each query's nearest point in windows; tell for which ones none outside can be nearer.
 
         Args:
-            queries: m.
-            side: rings above and below that the nearest point may lie in.
-            window: points of each of them.
+            queries: points.
+            side: rings above and below a query's own.
+            window: points of each ring.
         """
-        x, y, z = queries
-        level = jnp.sqrt(x**2 + y**2)
-        away = jnp.abs(self.index.elevation[:, None] - azimuth(level, z))
-        own = jnp.argmin(away, 0).astype(jnp.int32)
-        windows = _Windows.of(self.index, queries, own, side, window)
-        keys = windows.keys(self.radius)
-        nearest, squared = windows.smallest(keys, jnp.full(len(x), True))
+        level = jnp.sqrt(queries.x**2 + queries.y**2)
+        number = jnp.arange(self.cloud_rings, dtype=jnp.int32)[:, None]
+        elevation = _take(self.index.elevation, queries.lowest + number)
+        away = materialised(jnp.abs(elevation - azimuth(level, queries.z)))
+        own = jnp.min(jnp.where(away == jnp.min(away, 0), number, self.cloud_rings - 1), 0)
+        windows = _Windows.of(self, queries, queries.lowest + own, min(side, self.cloud_rings - 1), window)
+        place, squared = windows.smallest(windows.keys(), jnp.bool_(True))
         distance = jnp.sqrt(jnp.minimum(squared, self.radius**2))
-        outside = jnp.abs(jnp.arange(len(away), dtype=jnp.int32)[:, None] - own) > side
-        angle = jnp.min(jnp.where(outside, away, jnp.inf), 0)
-        beyond = jnp.sqrt(level**2 + z**2) * jnp.sin(jnp.minimum(angle, _QUARTER))
-        sure = (distance <= windows.reach()) & ((distance <= beyond) | jnp.isinf(angle))
+        angle = jnp.min(jnp.where(jnp.abs(number - own) > side, away, jnp.inf), 0)
+        beyond = jnp.sqrt(level**2 + queries.z**2) * jnp.sin(jnp.minimum(angle, _QUARTER))
+        return place, (distance <= windows.reach()) & ((distance <= beyond) | jnp.isinf(angle))
 
-        ring = jnp.where(nearest >= 0, _take(self.index.ring, jnp.maximum(nearest, 0)), own)
-        windows = _Windows.of(self.index, queries, ring, _BESIDE, _WIDE)
-        keys = windows.keys(self.radius)
-        step = jnp.abs(windows.ring_step())
+    def beside(
+        self, given: tuple[Queries, Int32[Array, " k"]], window: int
+    ) -> tuple[tuple[Array, Array], Bool[Array, " k"]]:
+        """Return the next point of the nearest one's ring and the nearest one of another, as ``nearest``."""
+        queries, nearest = given
+        ring = _take(self.index.ring, jnp.maximum(nearest, 0))
+        windows = _Windows.of(self, queries, jnp.maximum(ring, 0), _BESIDE, window)
+        keys, step = materialised(windows.keys()), jnp.abs(windows.ring_step())
         same, same_squared = windows.smallest(keys, (step == 0) & ~windows.is_at(nearest))
         other, other_squared = windows.smallest(keys, (step > 0) & (step < self.rings_apart))
         farthest = jnp.sqrt(jnp.minimum(jnp.maximum(same_squared, other_squared), self.radius**2))
-        return Nearest(nearest, same, other), sure & (farthest <= windows.reach())
+        found = nearest >= 0
+        same, other = (jnp.where(found, place, -1) for place in (same, other))
+        return (same, other), (farthest <= windows.reach()) | ~found
 
-    def among_all(self, queries: _Points) -> Nearest:
-        """Search all points."""
+    def nearest_of_all(self, queries: Queries) -> tuple[Array, Bool[Array, " k"]]:
+        """Return each query's nearest point."""
+        ring = self.index.ring[:, None]
+        squared = self._squared(queries)
+        within = (ring >= queries.lowest) & (ring < queries.lowest + self.cloud_rings)
+        return _least(squared, within), jnp.ones_like(queries.lowest, bool)
+
+    def beside_of_all(
+        self, given: tuple[Queries, Int32[Array, " k"]]
+    ) -> tuple[tuple[Array, Array], Bool[Array, " k"]]:
+        """Return what ``beside`` does."""
+        queries, nearest = given
+        ring = self.index.ring[:, None]
+        squared = self._squared(queries)
+        within = (ring >= queries.lowest) & (ring < queries.lowest + self.cloud_rings) & (nearest >= 0)
+        step = jnp.abs(ring - _take(self.index.ring, jnp.maximum(nearest, 0)))
+        another = jnp.arange(len(ring), dtype=jnp.int32)[:, None] != nearest
+        same = _least(squared, within & (step == 0) & another)
+        other = _least(squared, within & (step > 0) & (step < self.rings_apart))
+        return (same, other), jnp.ones_like(nearest, bool)
+
+    def _squared(self, queries: Queries) -> Float32[Array, "m k"]:
         index = self.index
-        ring = index.ring[:, None]
-        place = jnp.arange(len(ring), dtype=jnp.int32)[:, None]
-        points = index.x, index.y, index.z
-        squared = sum((axis[:, None] - query) ** 2 for axis, query in zip(points, queries, strict=True))
-        squared = materialised(jnp.where((ring >= 0) & (squared < self.radius**2), squared, jnp.inf))
+        squared = queries.away_from((index.x[:, None], index.y[:, None], index.z[:, None]))
+        return materialised(jnp.where(squared < self.radius**2, squared, jnp.inf))
 
-        def smallest(allowed: Array) -> Array:
-            least = jnp.min(jnp.where(allowed, squared, jnp.inf), 0)
-            here = allowed & (squared == least) & jnp.isfinite(least)
-            return jnp.max(jnp.where(here, place, -1), 0)
 
-        nearest = smallest(ring >= 0)
-        step = jnp.abs(ring - _take(index.ring, jnp.maximum(nearest, 0)))
-        same = smallest((step == 0) & (place != nearest))
-        return Nearest(nearest, same, smallest((step > 0) & (step < self.rings_apart)))
+def _least(squared: Float32[Array, "m k"], allowed: Bool[Array, "m k"]) -> Int32[Array, " k"]:
+    """Return the row of each column's smallest allowed value, -1 where there is no finite one."""
+    least = jnp.min(jnp.where(allowed, squared, jnp.inf), 0)
+    here = allowed & (squared == least) & jnp.isfinite(least)
+    return jnp.max(jnp.where(here, jnp.arange(len(squared), dtype=jnp.int32)[:, None], -1), 0)
 
 
 class _Windows(eqx.Module):
     """A window of each of a few rings for each query, around its own azimuth."""
 
-    index: RingIndex
-    queries: _Points
+    search: _Search
+    queries: Queries
     start: Int32[Array, "b k"]
     """Place of the ring's first point."""
     size: Int32[Array, "b k"]
-    """The ring's points; 0 beyond the sensor's rings."""
+    """The ring's points; 0 beyond the cloud's rings."""
+    elevation: Float32[Array, "b k"]
+    """Of the ring, rad."""
     begin: Int32[Array, "b k"]
     """From ``start`` to the window's first point; negative where the window begins at the ring's end."""
     length: int = eqx.field(static=True)
 
     @staticmethod
-    def of(
-        index: RingIndex, queries: _Points, ring: Int32[Array, " k"], side: int, length: int
-    ) -> "_Windows":
+    def of(search: _Search, queries: Queries, ring: Int32[Array, " k"], side: int, length: int) -> "_Windows":
         """Return windows in the rings from ``side`` below a given one to ``side`` above it."""
-        rings, sectors = len(index.elevation), index.sectors
-        sector = jnp.clip(_sector(azimuth(queries[0], queries[1]), sectors), 0, sectors - 1)
+        index = search.index
+        sectors = index.sectors
         band = ring + jnp.arange(-side, side + 1, dtype=jnp.int32)[:, None]
-        cell = jnp.clip(band, 0, rings - 1) * sectors
+        within = (band >= queries.lowest) & (band < queries.lowest + search.cloud_rings)
+        band = jnp.clip(band, 0, len(index.elevation) - 1)
+        cell = band * sectors
         start, end = _take(index.first, cell), _take(index.first, cell + sectors)
-        size = jnp.where((band >= 0) & (band < rings), end - start, 0)
-        begin = _take(index.first, cell + sector) - start - jnp.minimum(length, size) // 2
-        return _Windows(index, queries, *materialised((start, size, begin)), length)
+        size = jnp.where(within, end - start, 0)
+        middle = _take(index.first, cell + _sector(azimuth(queries.x, queries.y), sectors)) - start
+        begin = middle - jnp.minimum(length, size) // 2
+        elevation = _take(index.elevation, band)
+        return _Windows(search, queries, *materialised((start, size, elevation, begin)), length)
 
-    def keys(self, radius: Array) -> Int32[Array, "n k"]:
+    def keys(self) -> Int32[Array, "n k"]:
         """Return the squared distance of each point, the lowest bits replaced by its number.
 
         The number counts the rings and then the points. As integers, keys are ordered as the distances.
         """
         step = jnp.arange(self.length, dtype=jnp.int32)[:, None, None]
-        points = self.index.at(self._place(step, slice(None)))
-        squared = sum((axis - query) ** 2 for axis, query in zip(points, self.queries, strict=True))
+        squared = self.queries.away_from(self.search.index.at(self._place(step, slice(None))))
         # a ring shorter than the window would show its points twice
-        squared = jnp.where((step < self.size) & (squared < radius**2), squared, jnp.inf)
+        squared = jnp.where((step < self.size) & (squared < self.search.radius**2), squared, jnp.inf)
         band = jnp.arange(len(self.size), dtype=jnp.int32)[:, None]
         keys = jax.lax.bitcast_convert_type(squared, jnp.int32) & ~self._mask | step * len(self.size) + band
-        return materialised(keys.reshape(-1, keys.shape[-1]))
+        return keys.reshape(-1, keys.shape[-1])
 
-    def smallest(self, keys: Array, allowed: Bool[Array, "*n k"]) -> tuple[Array, Array]:
+    def smallest(self, keys: Int32[Array, "n k"], allowed: Bool[Array, "..."]) -> tuple[Array, Array]:
         """Return place and squared distance of each query's nearest point, -1 and infinite without one."""
         key = jnp.min(jnp.where(allowed, keys, jnp.iinfo(jnp.int32).max), 0)
         squared = jax.lax.bitcast_convert_type(key & ~self._mask, jnp.float32)
         number = jnp.minimum(key & self._mask, len(keys) - 1)
         column = jnp.arange(len(key))
         place = self._place(number // len(self.size), (number % len(self.size), column))
-        # keys that were not allowed come out as NaN
+        # a key that was not allowed comes out as NaN
         real = squared < jnp.inf
         return jnp.where(real, place, -1), jnp.where(real, squared, jnp.inf)
 
@@ -278,15 +328,15 @@ class _Windows(eqx.Module):
 
     def reach(self) -> Float32[Array, " k"]:
         """Return a distance within which no point of the rings lies outside of the windows, m."""
-        x, y, _ = self.queries
-        angle = azimuth(x, y)
-        before, after = (
-            _take(self.index.azimuth, self._place(jnp.int32(step), slice(None)))
-            for step in (0, self.length - 1)
-        )
+        x, y, z = self.queries.x, self.queries.y, self.queries.z
+        angle, level = azimuth(x, y), jnp.sqrt(x**2 + y**2)
+        ends = (self._place(jnp.int32(step), slice(None)) for step in (0, self.length - 1))
+        before, after = (_take(self.search.index.azimuth, end) for end in ends)
         gap = jnp.minimum(_turned(angle - before), _turned(after - angle))
-        aside = jnp.sqrt(x**2 + y**2) * jnp.sin(jnp.minimum(gap, _QUARTER))
-        return jnp.min(jnp.where(self.size > self.length, aside, jnp.inf), 0)
+        aside = level * jnp.sin(jnp.minimum(gap, _QUARTER))
+        lift = jnp.minimum(jnp.abs(self.elevation - azimuth(level, z)), _QUARTER)
+        above = jnp.sqrt(level**2 + z**2) * jnp.sin(lift)
+        return jnp.min(jnp.where(self.size > self.length, jnp.maximum(aside, above), jnp.inf), 0)
 
     @property
     def _mask(self) -> int:
@@ -300,7 +350,7 @@ class _Windows(eqx.Module):
 
 
 def _sector(angle: Array, sectors: int) -> Array:
-    return jnp.floor((angle / _TURN + 0.5) * sectors).astype(jnp.int32)
+    return jnp.clip(jnp.floor((angle / _TURN + 0.5) * sectors).astype(jnp.int32), 0, sectors - 1)
 
 
 def _turned(angle: Array) -> Array:

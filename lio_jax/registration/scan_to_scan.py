@@ -6,9 +6,10 @@ Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014, sectio
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float, Float32
+from jaxtyping import Array, Float32
 
 from lio_jax.core.materialise import materialised
 from lio_jax.core.params import Params
@@ -21,7 +22,7 @@ from lio_jax.registration.lines_and_planes import (
     LinesAndPlanes,
     line_through,
 )
-from lio_jax.registration.ring_index import RingIndex, nearest_by_ring, ring_index
+from lio_jax.registration.ring_index import Nearest, Queries, RingIndex, nearest_by_ring, ring_index
 from lio_jax.registration.rounds import Task
 from lio_jax.registration.scan_to_map import Frame
 
@@ -31,10 +32,8 @@ _Vectors = tuple[Array, Array, Array]
 class LastScan(eqx.Module):
     """What the next scan is matched with, in the lidar frame of one instant."""
 
-    corner: RingIndex
-    """Less sharp corners."""
-    surface: RingIndex
-    """Less flat points."""
+    index: RingIndex
+    """Less sharp points, then less flat ones, which count as rings of their own."""
 
 
 def last_scan(
@@ -51,23 +50,17 @@ def last_scan(
         surface: less flat points, likewise.
         corner_points: of ``corner``, in the frame of the instant, m.
         surface_points: of ``surface``, likewise.
-        rings: number of rings.
+        rings: number of the sensor's rings.
     """
-    return LastScan(
-        ring_index(corner_points, corner.ring, corner.mask, rings),
-        ring_index(surface_points, surface.ring, surface.mask, rings),
-    )
+    points = jnp.concatenate([corner_points, surface_points])
+    ring = jnp.concatenate([corner.ring, surface.ring + rings])
+    return LastScan(ring_index(points, ring, jnp.concatenate([corner.mask, surface.mask]), 2 * rings))
 
 
 def empty_scan(corners: int, surfaces: int, rings: int) -> LastScan:
     """Return a scan without points, of the given capacities."""
-    indices = (
-        ring_index(
-            jnp.zeros((size, 3), jnp.float32), jnp.zeros(size, jnp.int32), jnp.zeros(size, bool), rings
-        )
-        for size in (corners, surfaces)
-    )
-    return LastScan(*indices)
+    none = jnp.zeros(corners + surfaces, jnp.int32)
+    return LastScan(ring_index(jnp.zeros((len(none), 3), jnp.float32), none, none > 0, 2 * rings))
 
 
 class ScanToScan(Task):
@@ -95,19 +88,30 @@ class ScanToScan(Task):
         the nearest one of another ring. A-LOAM's two loops, up and down the rings from the nearest point,
         come to the same.
         """
-        frame = self.frames().corner
-        _, corner = frame.place(points.corner, T_target_lidar)
-        _, surface = frame.place(points.surface, T_target_lidar)
+        frame, corners = self.frames().corner, len(points.corner)
+        _, placed = frame.place(jnp.concatenate([points.corner, points.surface]), T_target_lidar)
+        mask = jnp.concatenate([points.corner_mask, points.surface_mask])
+        x, y, z = materialised(tuple(jnp.where(mask[:, None], placed, 0.0).astype(jnp.float32).T))
+        index = self.last.index
+        rings = len(index.elevation) // 2
+        lowest = jnp.where(jnp.arange(len(mask)) < corners, 0, rings).astype(jnp.int32)
         limits = self.params.scan_to_scan
-        within = limits.radius.astype(jnp.float32), limits.rings_apart.astype(jnp.float32)
-        return LinesAndPlanes(
-            _lines(self.last.corner, corner.astype(jnp.float32), points.corner_mask, *within),
-            _planes(self.last.surface, surface.astype(jnp.float32), points.surface_mask, *within),
+        found = nearest_by_ring(
+            index,
+            Queries(x, y, z, lowest),
+            mask,
+            rings,
+            limits.radius.astype(jnp.float32),
+            limits.rings_apart.astype(jnp.float32),
         )
+        at_corner, at_surface = (
+            jax.tree.map(lambda place, part=part: place[part], found)
+            for part in (slice(0, corners), slice(corners, None))
+        )
+        return LinesAndPlanes(_lines(index, at_corner), _planes(index, at_surface))
 
 
-def _lines(index: RingIndex, points: Array, mask: Array, radius: Array, rings_apart: Array) -> Lines:
-    found = nearest_by_ring(index, points, mask, radius, rings_apart)
+def _lines(index: RingIndex, found: Nearest) -> Lines:
     here, there = (index.at(jnp.maximum(place, 0)) for place in (found.nearest, found.other_ring))
     along = _difference(there, here)
     length = _length(along)
@@ -116,17 +120,15 @@ def _lines(index: RingIndex, points: Array, mask: Array, radius: Array, rings_ap
     return line_through(here, direction, valid)
 
 
-def _planes(index: RingIndex, points: Array, mask: Array, radius: Array, rings_apart: Array) -> Planes:
-    found = nearest_by_ring(index, points, mask, radius, rings_apart)
-    here, along, aside = materialised(
-        tuple(index.at(jnp.maximum(place, 0)) for place in (found.nearest, found.same_ring, found.other_ring))
-    )
+def _planes(index: RingIndex, found: Nearest) -> Planes:
+    places = (found.nearest, found.same_ring, found.other_ring)
+    here, along, aside = materialised(tuple(index.at(jnp.maximum(place, 0)) for place in places))
     along, aside = _difference(along, here), _difference(aside, here)
     normal = materialised(_cross(along, aside))
     area = _length(normal)
-    valid: Bool[Array, " k"] = (found.same_ring >= 0) & (found.other_ring >= 0) & (area > 0)
+    valid = (found.same_ring >= 0) & (found.other_ring >= 0) & (area > 0)
     nx, ny, nz = (axis / jnp.where(valid, area, 1.0) for axis in normal)
-    offset: Float[Array, " k"] = -(nx * here[0] + ny * here[1] + nz * here[2])
+    offset = -(nx * here[0] + ny * here[1] + nz * here[2])
     return Planes(jnp.stack([nx, ny, nz], -1), offset, valid)
 
 
