@@ -81,12 +81,13 @@ def shift_box(
         anchor: the block that the sensor is in.
         half_sides: half the box's edges along x, y and z, in blocks.
         margin: the sensor's least distance from a face, in blocks.
-        step: in blocks, of which the box's centre is rounded to a whole number.
+        step: in blocks; the box's centre is a multiple of it, rounded to a block.
     """
-    away = (anchor - pmap.cube).astype(jnp.float32)
+    number = jnp.round(pmap.cube / step)
+    away = anchor - number * step
     steps = jnp.ceil(jnp.maximum(jnp.abs(away) - (half_sides - margin), 0.0) / step)
-    centre = pmap.cube + jnp.round(jnp.sign(away) * steps * step).astype(jnp.int32)
-    return _cleared(pmap, centre, half_sides)
+    centre = jnp.round((number + jnp.sign(away) * steps) * step)
+    return _cleared(pmap, centre.astype(jnp.int32), half_sides)
 
 
 def _cleared(pmap: PointMap, centre: Int32[Array, "3"], half_sides: Float32[Array, "*d"]) -> PointMap:
