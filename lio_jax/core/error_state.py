@@ -34,6 +34,8 @@ EXTRINSIC_TRANSLATION = slice(20, 23)
 """m, IMU frame."""
 TIME_OFFSET = slice(23, 24)
 """s."""
+LAG = slice(24, 30)
+"""Behind the state's own error in :class:`Swept`: rotation (rad) and position (m), IMU frame."""
 
 
 def retract(nav: NavState, error: Float[Array, "24"]) -> NavState:
@@ -110,3 +112,20 @@ class Uncertain(eqx.Module):
 
     nav: NavState
     covariance: Float[Array, "24 24"]
+
+
+class Swept(eqx.Module):
+    """A navigation state at a sweep's end, and how its pose's error there differs from the sweep's mean."""
+
+    nav: NavState
+    covariance: Float[Array, "30 30"]
+    """Of the error, and of what the pose's error is ahead of its mean over the sweep's points (``LAG``)."""
+
+    @staticmethod
+    def at_once(state: Uncertain) -> "Swept":
+        """Return a state that is seen at one instant."""
+        return Swept(state.nav, jnp.pad(state.covariance, (0, LAG.stop - LAG.start)))
+
+    def at_end(self) -> Uncertain:
+        """Return the state at the sweep's end alone."""
+        return Uncertain(self.nav, self.covariance[:DOF, :DOF])

@@ -100,6 +100,9 @@ class RegistrationParams(eqx.Module):
     """... and moves less than this, m."""
     degeneracy_ratio: Scalar
     """A direction with less than this fraction of the strongest direction's information is degenerate."""
+    inertial_degeneracy_ratio: Scalar
+    """The same in a filter, whose prediction has a covariance: it weighs what little is known, such as a few
+    trees on a plain, against what a map's roughness feigns."""
     min_matches: Scalar
     """Matched points below which a scan counts as lost."""
 
@@ -269,6 +272,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "rotation_tolerance": 1e-4,
         "translation_tolerance": 1e-3,
         "degeneracy_ratio": 0.01,
+        "inertial_degeneracy_ratio": 0.003,
         "min_matches": 50.0,
     },
     "scan_to_scan": {"radius": 5.0, "rings_apart": 2.5},
@@ -357,12 +361,14 @@ _MAY_BE_ZERO = {
     "point_map.nearer_by",
     "motion.initial_error",
     "registration.degeneracy_ratio",
+    "registration.inertial_degeneracy_ratio",
     "motion.error_decay",
 }
 _AT_MOST_ONE = {
     "knn.min_score",
     "motion.error_decay",
     "registration.degeneracy_ratio",
+    "registration.inertial_degeneracy_ratio",
     "registration.information_scale",
 }
 

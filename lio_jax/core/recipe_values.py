@@ -35,7 +35,7 @@ RECIPE_VALUES: dict[str, dict[str, Any]] = {
         "params.registration.reassociation_distance": 0.01,
         "params.registration.rotation_tolerance": 1e-3,
         "params.registration.translation_tolerance": 1e-3,
-        "params.registration.degeneracy_ratio": 0.0,
+        "params.registration.inertial_degeneracy_ratio": 0.0,
     },
     "loam": {
         "config.imu.use": False,

@@ -1,8 +1,9 @@
 """The iterated update of the navigation state."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -13,12 +14,13 @@ from lio_jax.core.error_state import (
     EXTRINSIC_ROTATION,
     EXTRINSIC_TRANSLATION,
     GRAVITY,
+    LAG,
     POSITION,
     ROTATION,
     TIME_OFFSET,
     VELOCITY,
+    Swept,
     Uncertain,
-    local,
     retract,
     sphere_basis,
 )
@@ -28,8 +30,60 @@ from lio_jax.estimation.pose_measurement import lidar_pose_jacobian
 from lio_jax.imu.rotation_integrals import rotation_exponential, rotation_integrals
 
 
+class _State(NamedTuple):
+    """A prediction and the error that it is found to have: all iterates live in one tangent space."""
+
+    predicted: NavState
+    error: Float[Array, "30"]
+    """As in :class:`Swept`."""
+
+    def end(self) -> NavState:
+        """Return the state at the sweep's end."""
+        return retract(self.predicted, self.error[:DOF])
+
+    def mean(self) -> NavState:
+        """Return the state with the sweep's mean pose."""
+        return retract(self.predicted, self._mean_error())
+
+    def jacobian(self) -> Float[Array, "6 30"]:
+        """Return the derivative of the mean lidar pose by the error."""
+        by_mean = lidar_pose_jacobian(self.mean()) @ reset_jacobian(self.predicted, self._mean_error())
+        return jnp.concatenate([by_mean, -by_mean[:, : POSITION.stop]], axis=1)
+
+    def add(self, error: Float[Array, "30"]) -> "_State":
+        """Return the state with the error added."""
+        return _State(self.predicted, self.error + error)
+
+    def subtract(self, other: "_State") -> Float[Array, "30"]:
+        """Return the error by which the other differs."""
+        return other.error - self.error
+
+    def reset(self, error: Float[Array, "30"]) -> Float[Array, "30 30"]:
+        """Return the change of tangent space by the error: none."""
+        return jnp.eye(error.shape[0], dtype=error.dtype)
+
+    def _mean_error(self) -> Float[Array, "24"]:
+        lag = self.error[LAG]
+        return self.error[:DOF] - jnp.pad(lag, (0, DOF - lag.shape[0]))
+
+
+class _AtMean(eqx.Module):
+    """A measurement of the sweep's mean pose."""
+
+    measure: Callable[..., Measurement]
+
+    def __call__(self, state: _State, *aux: Any) -> Measurement:
+        return self.measure(state.mean(), *aux)
+
+
+def predicted_pose_covariance(prior: Swept) -> Float[Array, "6 6"]:
+    """Return the covariance of the mean lidar pose over a sweep, perturbed as in the update."""
+    jacobian = _unchanged(prior).jacobian()
+    return jacobian @ prior.covariance @ jacobian.T
+
+
 def update_nav(
-    prior: Uncertain,
+    prior: Swept,
     measure: Callable[..., Measurement],
     *,
     max_iterations: int,
@@ -37,35 +91,51 @@ def update_nav(
     translation_tolerance: Float[Array, ""],
     first_aux: Any = None,
     again: Callable[..., Measurement] | None = None,
-) -> Update:
-    """Return the iterated update of a navigation state; its ``state`` is an :class:`Uncertain`.
+) -> tuple[Update, NavState]:
+    """Return the iterated update of a navigation state, and the state with the pose the measurement saw.
+
+    A sweep that was put together along the predicted motion is matched as a rigid body, so it measures the
+    mean of the pose's error over its points. The error at the sweep's end follows from their correlation.
 
     Args:
         prior: predicted state.
-        measure: linearises the measurement at the :class:`NavState` it is given with respect to the lidar's
-            pose, perturbed as in :func:`lidar_pose_jacobian`; see :func:`iterated_update`.
+        measure: linearises the measurement at the :class:`NavState` it is given, whose pose is the sweep's
+            mean, with respect to the lidar's pose, perturbed as in :func:`lidar_pose_jacobian`; see
+            :func:`iterated_update`.
         max_iterations: bound of the loop, at least 1.
         rotation_tolerance: converged when no component of a step turns more than this, rad ...
         translation_tolerance: ... and none moves more than this, m.
         first_aux: see :func:`iterated_update`; ``again`` likewise.
+
+    Returns:
+        The update, with an :class:`Uncertain` of the sweep's end as its ``state``, and the state with the
+        sweep's mean pose.
     """
     dtype = prior.covariance.dtype
-    tolerance = jnp.full(DOF, jnp.inf, dtype)
+    tolerance = jnp.full(LAG.stop, jnp.inf, dtype)
     tolerance = tolerance.at[ROTATION].set(rotation_tolerance).at[POSITION].set(translation_tolerance)
     update = iterated_update(
-        prior.nav,
+        _unchanged(prior),
         prior.covariance,
-        measure,
-        lidar_pose_jacobian,
-        retract,
-        local,
+        _AtMean(measure),
+        _State.jacobian,
+        _State.add,
+        _State.subtract,
         max_iterations=max_iterations,
         tolerance=tolerance,
         first_aux=first_aux,
-        again=again,
-        reset=reset_jacobian,
+        again=again and _AtMean(again),
+        reset=_State.reset,
     )
-    return update._replace(state=Uncertain(update.state, update.covariance))
+    found: _State = update.state
+    turn = reset_jacobian(prior.nav, found.error[:DOF])
+    covariance = turn @ update.covariance[:DOF, :DOF] @ turn.T
+    end = Uncertain(found.end(), (covariance + covariance.T) / 2)
+    return update._replace(state=end, covariance=end.covariance), found.mean()
+
+
+def _unchanged(prior: Swept) -> _State:
+    return _State(prior.nav, jnp.zeros(prior.covariance.shape[0], prior.covariance.dtype))
 
 
 def reset_jacobian(nav: NavState, error: Float[Array, "24"]) -> Float[Array, "24 24"]:

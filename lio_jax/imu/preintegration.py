@@ -99,7 +99,7 @@ def preintegrate_parallel(
         gyro_bias=gyro_bias,
         accel_bias=accel_bias,
         bias_jacobian=jnp.where(measured, jacobian, 0.0),
-        covariance=process_noise(effect, noise, measured),
+        covariance=process_noise(effect.inputs, noise, measured),
         measured=measured,
     )
 

@@ -12,9 +12,12 @@ from lio_jax.core.error_state import (
     BIASES,
     DOF,
     GRAVITY,
+    LAG,
     POSITION,
+    ROTATION,
     TIME_OFFSET,
     VELOCITY,
+    Swept,
     Uncertain,
     sphere_basis,
 )
@@ -22,10 +25,13 @@ from lio_jax.core.params import ImuParams
 from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.core.types import ImuBatch, NavState
 from lio_jax.imu.discretise import discretise
-from lio_jax.imu.increments import NAV_DOF, Increments, Sensitivity, accumulate, nav_transition, sensitivity
+from lio_jax.imu.increments import NAV_DOF, Increments, accumulate, nav_transition, sensitivity
 from lio_jax.imu.path import Path
 from lio_jax.imu.process_noise import process_noise
 from lio_jax.imu.sampling import Intervals, sample_intervals
+from lio_jax.imu.sweep_lag import LAG_DOF, lag_of_durations, lag_of_inputs, still_to_show
+
+_LAG_POSITION = slice(LAG.start + 3, LAG.stop)
 
 
 def propagate(
@@ -35,6 +41,19 @@ def propagate(
     start: Float[Array, ""],
     end: Float[Array, ""],
 ) -> tuple[Uncertain, Path]:
+    """Carry a state from ``start`` to ``end`` as :func:`propagate_sweep` does, without a sweep."""
+    swept, path = propagate_sweep(state, imu, params, start, end, end)
+    return swept.at_end(), path
+
+
+def propagate_sweep(
+    state: Uncertain,
+    imu: ImuBatch,
+    params: ImuParams,
+    start: Float[Array, ""],
+    end: Float[Array, ""],
+    sweep_start: Float[Array, ""],
+) -> tuple[Swept, Path]:
     """Carry a state from ``start`` to ``end`` along the inertial samples, with its covariance.
 
     The samples are sampled as :func:`lio_jax.imu.sampling.sample_intervals` says, at the lidar's clock. Where
@@ -47,9 +66,10 @@ def propagate(
         params: noise densities.
         start: usually the last scan's end, s from this scan's start.
         end: s from this scan's start, not before ``start``.
+        sweep_start: time of the sweep's first point, s from this scan's start; its last is at ``end``.
 
     Returns:
-        The state at ``end``, and the motion in between.
+        The state at ``end`` and how it differs from the sweep's mean, and the motion in between.
     """
     nav = state.nav
     intervals, shift = jax.jvp(
@@ -62,11 +82,20 @@ def propagate(
     moved = dataclasses.replace(nav, T_world_imu=last, velocity=path.velocity[-1])
 
     effect = sensitivity(increments, intervals.duration, path.rate, path.accel)
-    transition = _transition(nav, increments, effect, shift, path.gravity, intervals.measured)
+    middle = (path.time[:-1] + path.time[1:]) / 2
+    lag_inputs = lag_of_inputs(effect, middle, sweep_start, end)
+    inputs = jnp.concatenate([effect.inputs, lag_inputs], axis=1)
+    signal = jnp.concatenate([shift.gyro, shift.accel], axis=1)
+    lag_by_offset = lag_of_durations(effect, shift.duration, path.time, sweep_start, end)
+    moved_knots = jnp.concatenate([shift.duration @ effect.duration, lag_by_offset])
+    by_offset = jnp.einsum("nij,nj->i", inputs, signal) + moved_knots
+    by_bias = jnp.where(intervals.measured, -jnp.sum(inputs, axis=0), 0.0)
+    shown = still_to_show(start, sweep_start, end)
+    transition = _transition(nav, increments, path.gravity, by_bias, by_offset, shown)
     noise = discretise(params, intervals.duration, intervals.gap, intervals.known)
-    added = process_noise(effect, noise, intervals.measured)
-    covariance = _carry_covariance(state.covariance, transition).at[:15, :15].add(added)
-    return Uncertain(moved, (covariance + covariance.T) / 2), path
+    added = process_noise(inputs, noise, intervals.measured)
+    covariance = transition @ state.covariance @ transition.T + _placed(added)
+    return Swept(moved, (covariance + covariance.T) / 2), path
 
 
 def path_along(nav: NavState, imu: ImuBatch, start: Float[Array, ""], end: Float[Array, ""]) -> Path:
@@ -101,38 +130,50 @@ def _follow(nav: NavState, intervals: Intervals, start: Float[Array, ""]) -> tup
 def _transition(
     nav: NavState,
     increments: Increments,
-    effect: Sensitivity,
-    shift: Intervals,
     gravity: Float[Array, "3"],
-    measured: Array,
-) -> Float[Array, "9 24"]:
-    """Return the derivative of rotation, position and velocity at the end by the whole error at the start.
+    by_bias: Float[Array, "15 6"],
+    by_offset: Float[Array, "15"],
+    to_show: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]],
+) -> Float[Array, "30 24"]:
+    """Return the derivative of the error at the end, and of the lag, by the error at the start.
 
-    The time offset acts through ``shift``, its effect on what is sampled.
+    Args:
+        nav: at the start.
+        increments: since then.
+        gravity: m/s^2, zero where nothing is measured.
+        by_bias: derivative of rotation, position and velocity at the end and of the lag.
+        by_offset: the same by the time offset.
+        to_show: for the start, as :func:`still_to_show` returns it.
     """
     elapsed = increments.time[-1]
     turned = jaxlie.SO3(increments.rotation.wxyz[-1])
     last = nav.T_world_imu.rotation() @ turned
     fall = rotation_matrix(last).T @ -skew(gravity) @ sphere_basis(nav.gravity)
-    signal = jnp.concatenate([shift.gyro, shift.accel], axis=1)
-    by_offset = jnp.einsum("nij,nj->i", effect.inputs, signal) + shift.duration @ effect.duration
-    every = slice(0, NAV_DOF)
+    carried = nav_transition(turned, increments.velocity[-1], increments.position[-1], elapsed)
+    every, rest = slice(0, NAV_DOF), slice(NAV_DOF, DOF)
+    by_bias_or_offset = (
+        (rows, columns, effect[part])
+        for columns, effect in ((BIASES, by_bias), (TIME_OFFSET, by_offset[:, None]))
+        for rows, part in ((every, every), (LAG, slice(NAV_DOF, None)))
+    )
+    _, linear, quadratic = to_show
     return from_blocks(
-        (NAV_DOF, DOF),
-        (every, every, nav_transition(turned, increments.velocity[-1], increments.position[-1], elapsed)),
-        (every, BIASES, jnp.where(measured, -jnp.sum(effect.inputs, 0), 0.0)),
+        (LAG.stop, DOF),
+        (every, every, carried),
+        (rest, rest, jnp.eye(DOF - NAV_DOF, dtype=carried.dtype)),
         (POSITION, GRAVITY, fall * elapsed**2 / 2),
         (VELOCITY, GRAVITY, fall * elapsed),
-        (every, TIME_OFFSET, by_offset[:, None]),
+        (_LAG_POSITION, ROTATION, quadratic * carried[POSITION, ROTATION]),
+        (_LAG_POSITION, VELOCITY, linear * carried[POSITION, VELOCITY]),
+        (_LAG_POSITION, GRAVITY, quadratic * fall * elapsed**2 / 2),
+        *by_bias_or_offset,
     )
 
 
-def _carry_covariance(
-    covariance: Float[Array, "24 24"], transition: Float[Array, "9 24"]
-) -> Float[Array, "24 24"]:
-    """Return Phi P Phi' where all rows of Phi but the first nine are the identity's."""
-    rows = transition @ covariance
-    rest = rows[:, NAV_DOF:]
-    top = jnp.concatenate([rows @ transition.T, rest], axis=1)
-    bottom = jnp.concatenate([rest.T, covariance[NAV_DOF:, NAV_DOF:]], axis=1)
-    return jnp.concatenate([top, bottom])
+def _placed(noise: Float[Array, "21 21"]) -> Float[Array, "30 30"]:
+    """Return the covariance of navigation state, lag and biases at their places in the error."""
+    places = (slice(0, NAV_DOF), LAG, BIASES)
+    parts = (slice(0, NAV_DOF), slice(NAV_DOF, NAV_DOF + LAG_DOF), slice(NAV_DOF + LAG_DOF, None))
+    pairs = tuple(zip(places, parts, strict=True))
+    blocks = ((rows, columns, noise[part, other]) for rows, part in pairs for columns, other in pairs)
+    return from_blocks((LAG.stop, LAG.stop), *blocks)

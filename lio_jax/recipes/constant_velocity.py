@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.error_state import DOF, VELOCITY, Uncertain
+from lio_jax.core.error_state import DOF, VELOCITY, Swept, Uncertain
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan, initial_nav_state
 from lio_jax.imu.discretise import UNKNOWN_ACCEL, UNKNOWN_RATE
@@ -59,7 +59,7 @@ def mean_rate(last: NavState, nav: NavState, scan: Scan) -> Float[Array, "3"]:
 
 def predicted_without_samples(
     params: Params, last: Uncertain, rate: Float[Array, "3"], scan: Scan, first: Bool[Array, ""]
-) -> tuple[Uncertain, Path]:
+) -> tuple[Swept, Path]:
     """Return the state at the scan's end and the motion since the last one's if the body went on as it moved.
 
     Args:
@@ -81,10 +81,16 @@ def predicted_without_samples(
     floating = dataclasses.replace(last.nav, gravity=_WEIGHTLESS * last.nav.gravity)
     samples = _imagined_samples(floating, rate, scan)
     prior, path = predicted(
-        dataclasses.replace(params, imu=imu), Uncertain(floating, last.covariance), scan, samples, first
+        dataclasses.replace(params, imu=imu),
+        Uncertain(floating, last.covariance),
+        scan,
+        samples,
+        first,
+        # at its middle, where the scan is predicted, its pose is the mean
+        sweep_start=scan.duration,
     )
     nav = dataclasses.replace(prior.nav, gravity=last.nav.gravity)
-    return Uncertain(nav, prior.covariance), path
+    return Swept(nav, prior.covariance), path
 
 
 def _imagined_samples(nav: NavState, rate: Float[Array, "3"], scan: Scan) -> ImuBatch:

@@ -19,7 +19,6 @@ from lio_jax.core.error_state import Uncertain
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
-from lio_jax.estimation.nav_update import update_nav
 from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.imu.path import deskew_along
 from lio_jax.lidar.voxel_mean import mean_per_voxel
@@ -34,6 +33,7 @@ from lio_jax.recipes.constant_velocity import (
 )
 from lio_jax.recipes.inertial_filter import (
     Linearised,
+    corrected,
     evidence_of,
     levelled_start,
     lidar_pose,
@@ -114,7 +114,8 @@ def step(
             prior, path = predicted_without_samples(params, state.uncertain, state.rate, scan, first)
         else:
             to_end = jnp.zeros_like(state.to_end)
-            prior, path = predicted(params, state.uncertain, scan, imu, first)
+            # as FAST-LIO2 does, the match is taken for one of the pose at the scan's end
+            prior, path = predicted(params, state.uncertain, scan, imu, first, sweep_start=scan.duration)
         T_predicted = lidar_pose(prior.nav)
     with jax.named_scope("thin"):
         points, time, in_range = _filtered(config.fast_lio2.point_filter_num, params, scan)
@@ -124,15 +125,7 @@ def step(
     with jax.named_scope("update"):
         frame = Frame(*anchor_of(T_predicted.translation(), EDGE * params.map.voxel_size))
         scan_match = _ScanMatch(state.map, thin.points, thin.mask, frame, params, config.knn.neighbours)
-        update = update_nav(
-            prior,
-            scan_match.measure,
-            max_iterations=config.registration.max_iterations,
-            rotation_tolerance=params.registration.rotation_tolerance,
-            translation_tolerance=params.registration.translation_tolerance,
-            first_aux=scan_match.before(prior.nav),
-            again=scan_match.again,
-        )
+        update, _ = corrected(config, params, prior, scan_match, scan_match.before(prior.nav))
         posterior: Uncertain = update.state
         lost = (update.status > ITERATION_LIMIT) & ~first
         T_world_lidar = lidar_pose(posterior.nav)
@@ -234,7 +227,7 @@ class _ScanMatch(eqx.Module):
         settings = self.params.registration
         equations = linearise(association.found, self.points, lidar_pose(nav), self.frame, self.params)
         information, gradient, degenerate = keep_observed(
-            equations.hessian, equations.gradient, equations.arm_squared, settings.degeneracy_ratio
+            equations.hessian, equations.gradient, equations.arm_squared, settings.inertial_degeneracy_ratio
         )
         return Measurement(
             information=settings.information_scale * information,

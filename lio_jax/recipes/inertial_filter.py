@@ -1,12 +1,15 @@
 """What the recipes with an error-state filter share: the start, the prediction and the form of the result."""
 
+from typing import Any, Protocol, runtime_checkable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from lio_jax.core.blocks import from_blocks
+from lio_jax.core.config import Config
 from lio_jax.core.error_state import (
     DOF,
     EXTRINSIC_ROTATION,
@@ -14,17 +17,18 @@ from lio_jax.core.error_state import (
     GRAVITY,
     POSITION,
     ROTATION,
+    Swept,
     Uncertain,
     sphere_basis,
 )
 from lio_jax.core.params import Params
 from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.core.types import ImuBatch, NavState, Scan
-from lio_jax.estimation.iterated_filter import Update
-from lio_jax.estimation.pose_measurement import lidar_pose_jacobian
+from lio_jax.estimation.iterated_filter import Measurement, Update
+from lio_jax.estimation.nav_update import predicted_pose_covariance, update_nav
 from lio_jax.imu.initialise import initialise_at_rest
 from lio_jax.imu.path import Path
-from lio_jax.imu.strapdown import propagate
+from lio_jax.imu.strapdown import propagate_sweep
 from lio_jax.recipes.output import Evidence
 from lio_jax.registration.gauss_newton import NormalEquations, Registration
 from lio_jax.registration.point_evidence import PointEvidence
@@ -70,15 +74,65 @@ def held_at_lidar(state: Uncertain) -> Uncertain:
 
 
 def predicted(
-    params: Params, last: Uncertain, scan: Scan, imu: ImuBatch, first: Bool[Array, ""]
-) -> tuple[Uncertain, Path]:
-    """Return the state at the scan's end and the motion since the last scan's end."""
+    params: Params,
+    last: Uncertain,
+    scan: Scan,
+    imu: ImuBatch,
+    first: Bool[Array, ""],
+    sweep_start: Float[Array, ""] | float = 0.0,
+) -> tuple[Swept, Path]:
+    """Return the state at the scan's end and the motion since the last scan's end.
+
+    Args:
+        params: traced.
+        last: at the last scan's end.
+        scan: the scan to predict.
+        imu: samples around the time since then.
+        first: no scan was seen before.
+        sweep_start: time of the scan's first point, s.
+    """
     dtype = last.covariance.dtype
     end = scan.duration.astype(dtype)
     start = jnp.where(first, 0.0, end - scan.interval.astype(dtype))
-    moved, path = propagate(last, imu, params.imu, start, end)
+    moved, path = propagate_sweep(last, imu, params.imu, start, end, jnp.asarray(sweep_start, dtype))
     # the first scan's end is the world's origin: its samples only deskew it
-    return jax.tree.map(lambda new, old: jnp.where(first, old, new), moved, last), path
+    return jax.tree.map(lambda new, old: jnp.where(first, old, new), moved, Swept.at_once(last)), path
+
+
+@runtime_checkable
+class ScanMatch(Protocol):
+    """A scan against a map, as a measurement of the lidar's pose; a pytree."""
+
+    def measure(self, nav: NavState, last: Any) -> Measurement:
+        """Match and linearise at a state, given what the last linearisation left."""
+        ...
+
+    def again(self, nav: NavState, last: Any) -> Measurement:
+        """Linearise at a state with the choices of the last linearisation."""
+        ...
+
+
+def corrected(
+    config: Config, params: Params, prior: Swept, scan_match: ScanMatch, before: Any
+) -> tuple[Update, NavState]:
+    """Return the update by a scan match, and the state with the pose at which the scan lies on the map.
+
+    Args:
+        config: static.
+        params: traced.
+        prior: predicted state.
+        scan_match: the measurement.
+        before: what its first linearisation starts from.
+    """
+    return update_nav(
+        prior,
+        scan_match.measure,
+        max_iterations=config.registration.max_iterations,
+        rotation_tolerance=params.registration.rotation_tolerance,
+        translation_tolerance=params.registration.translation_tolerance,
+        first_aux=before,
+        again=scan_match.again,
+    )
 
 
 def lidar_pose(nav: NavState) -> jaxlie.SE3:
@@ -113,14 +167,13 @@ def registration_of(update: Update, last: Linearised, T_world_lidar: jaxlie.SE3)
     )
 
 
-def evidence_of(update: Update, prior: Uncertain, points: PointEvidence | None = None) -> Evidence:
+def evidence_of(update: Update, prior: Swept, points: PointEvidence | None = None) -> Evidence:
     """Return how well a scan was foretold."""
-    jacobian = lidar_pose_jacobian(prior.nav)
     measured = update.measurement
     return Evidence(
         innovation=update.innovation,
         information=measured.information,
         gradient=measured.gradient,
-        pose_covariance=jacobian @ prior.covariance @ jacobian.T,
+        pose_covariance=predicted_pose_covariance(prior),
         points=points,
     )

@@ -16,13 +16,13 @@ from lio_jax.core.implicit import known
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
-from lio_jax.estimation.nav_update import update_nav
 from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.imu.path import Path, deskew_along
 from lio_jax.lidar.thinning import ThinnedScan, thinned
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
 from lio_jax.recipes.inertial_filter import (
     Linearised,
+    corrected,
     evidence_of,
     levelled_start,
     lidar_pose,
@@ -90,25 +90,17 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
     with jax.named_scope("update"):
         frame = Frame(*anchor_of(T_predicted.translation(), params.map.voxel_size))
         scan_match = _ScanMatch(state.map, to_match, thin.matched.mask, frame, state.prediction_error, params)
-        update = update_nav(
-            prior,
-            scan_match.measure,
-            max_iterations=config.registration.max_iterations,
-            rotation_tolerance=params.registration.rotation_tolerance,
-            translation_tolerance=params.registration.translation_tolerance,
-            first_aux=scan_match.before(T_predicted),
-            again=scan_match.again,
-        )
+        update, matched = corrected(config, params, prior, scan_match, scan_match.before(T_predicted))
         posterior: Uncertain = update.state
         lost = (update.status > ITERATION_LIMIT) & ~first
-        T_world_lidar = lidar_pose(posterior.nav)
+        T_world_lidar, T_matched = lidar_pose(posterior.nav), lidar_pose(matched)
         matches = update.measurement.aux.association.found
-        evidence = point_evidence(matches, to_match, T_world_lidar, frame, params)
-        missed = jnp.linalg.norm((T_predicted.inverse() @ T_world_lidar).translation())
+        evidence = point_evidence(matches, to_match, T_matched, frame, params)
+        missed = jnp.linalg.norm((T_predicted.inverse() @ T_matched).translation())
         error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
     with jax.named_scope("insert"):
         # the map is a constant of the derivative
-        _, placed = jax.lax.stop_gradient(frame.place(points, T_world_lidar))
+        _, placed = jax.lax.stop_gradient(frame.place(points, T_matched))
         vmap, added = insert(
             state.map,
             placed,
@@ -203,7 +195,7 @@ class _ScanMatch(eqx.Module):
             self.params,
         )
         information, gradient, degenerate = keep_observed(
-            equations.hessian, equations.gradient, equations.arm_squared, settings.degeneracy_ratio
+            equations.hessian, equations.gradient, equations.arm_squared, settings.inertial_degeneracy_ratio
         )
         return Measurement(
             information=settings.information_scale * information,

@@ -1,8 +1,9 @@
-"""From the rows that builders write in double precision to a World of float32 arrays."""
+"""From the rows that builders write to a World of float64 arrays."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -77,7 +78,7 @@ def assembled(
         traffic: what moves.
 
     Returns:
-        float32 arrays; angles in rad, lengths in m.
+        float64 arrays whatever JAX's mode; angles in rad, lengths in m.
     """
     origin = np.asarray(origin, float)
     point, *plane = _columns(planes, 3, 3, 1)
@@ -86,12 +87,12 @@ def assembled(
     base, *cylinder = _columns(cylinders, 3, 1, 1, 1)
     heart, *sphere = _columns(spheres, 3, 1, 1)
     solids = Solids(
-        Planes(*_single([point - origin, *plane])),
+        Planes(*_double([point - origin, *plane])),
         _ground(terrain, origin),
-        Boxes(*_single([center - origin, *box])),
-        TiltedBoxes(*_single([middle - origin, half_size, rotation.reshape(-1, 3, 3), reflectivity])),
-        Cylinders(*_single([base - origin, *cylinder])),
-        Spheres(*_single([heart - origin, *sphere])),
+        Boxes(*_double([center - origin, *box])),
+        TiltedBoxes(*_double([middle - origin, half_size, rotation.reshape(-1, 3, 3), reflectivity])),
+        Cylinders(*_double([base - origin, *cylinder])),
+        Spheres(*_double([heart - origin, *sphere])),
     )
     return World(solids, _movers(traffic, origin))
 
@@ -118,16 +119,17 @@ def _columns(rows: Rows, *widths: int) -> list[NDArray[np.float64]]:
     return [part[:, 0] if width == 1 else part for part, width in zip(parts, widths, strict=True)]
 
 
-def _single(parts: Sequence[NDArray[np.float64]]) -> list[Array]:
-    return [jnp.asarray(part, jnp.float32) for part in parts]
+def _double(parts: Sequence[NDArray[np.float64]]) -> list[Array]:
+    with jax.enable_x64(True):
+        return [jnp.asarray(part, jnp.float64) for part in parts]
 
 
 def _ground(terrain: Terrain | None, origin: NDArray[np.float64]) -> Grounds:
     if terrain is None:
-        return Grounds(*(jnp.zeros(shape, jnp.float32) for shape in ((0,), (0, 1), (0, 1, 2), (0, 1), (0,))))
+        return Grounds(*_double([np.zeros(shape) for shape in ((0,), (0, 1), (0, 1, 2), (0, 1), (0,))]))
     phase = np.mod(terrain.phase + terrain.wave @ origin[:2], 2 * np.pi)
     parts = (-origin[2], terrain.amplitude, terrain.wave, phase, terrain.reflectivity)
-    return Grounds(*_single([np.asarray(part)[None] for part in parts]))
+    return Grounds(*_double([np.asarray(part)[None] for part in parts]))
 
 
 def _movers(traffic: Traffic | None, origin: NDArray[np.float64]) -> Movers:
@@ -135,6 +137,6 @@ def _movers(traffic: Traffic | None, origin: NDArray[np.float64]) -> Movers:
         traffic = Traffic(
             np.zeros((1, 1, 3)), np.zeros((1, 1)), np.ones(1), np.zeros(0, np.int64), np.zeros((0, 8))
         )
-    path, yaw, period = _single([traffic.path - origin, traffic.yaw, traffic.period])
-    boxes = Boxes(*_single(_columns(traffic.boxes, 3, 3, 1, 1)))
+    path, yaw, period = _double([traffic.path - origin, traffic.yaw, traffic.period])
+    boxes = Boxes(*_double(_columns(traffic.boxes, 3, 3, 1, 1)))
     return Movers(path, yaw, period, jnp.asarray(traffic.body, jnp.int32), boxes)

@@ -48,7 +48,8 @@ def check_clear(world: World, times: NDArray[np.float64], positions: NDArray[np.
     reach = float(np.linalg.norm(ahead, axis=1).max())
     # a group's part is centred on its first position
     radius = (TOGETHER + 1) * reach + 2 * CLEARANCE
-    counts = counts_along(world, jnp.asarray(positions[::TOGETHER], jnp.float32), radius)
+    with jax.enable_x64(True):
+        counts = counts_along(world, jnp.asarray(positions[::TOGETHER]), radius)
     size = _GROUPS * TOGETHER
     for start in range(0, len(times), size):
         # the last call's surplus repeats the last position: every call has one shape
@@ -99,8 +100,5 @@ def _group_touched(
     limit = jnp.concatenate([step, jnp.full((len(times), len(_AROUND)), CLEARANCE)], axis=1)
     origins = jnp.broadcast_to((positions - positions[0])[:, None], rays.shape)
     sent = jnp.broadcast_to(times - times[0], limit.shape)
-    single = jax.tree.map(
-        lambda leaf: leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf,
-        (part, origins.reshape(-1, 3), rays.reshape(-1, 3), sent.ravel()),
-    )
-    return jnp.any(cast(*single).distance.reshape(limit.shape) < limit, axis=1)
+    hit = cast(part, origins.reshape(-1, 3), rays.reshape(-1, 3), sent.ravel())
+    return jnp.any(hit.distance.reshape(limit.shape) < limit, axis=1)

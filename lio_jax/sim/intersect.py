@@ -22,17 +22,17 @@ _GROUND_END = 300.0
 class Rays(NamedTuple):
     """Origins and unit directions, one array per coordinate: the layout that vectorises."""
 
-    x: Float[Array, " n"]
-    y: Float[Array, " n"]
-    z: Float[Array, " n"]
-    dx: Float[Array, " n"]
-    dy: Float[Array, " n"]
-    dz: Float[Array, " n"]
-    time: Float[Array, " n"]
+    x: Float[Array, "*n"]
+    y: Float[Array, "*n"]
+    z: Float[Array, "*n"]
+    dx: Float[Array, "*n"]
+    dy: Float[Array, "*n"]
+    dz: Float[Array, "*n"]
+    time: Float[Array, "*n"]
     """s since the instant at which the movers were placed."""
 
 
-def plane_distance(plane: Any, rays: Rays) -> Float[Array, " n"]:
+def plane_distance(plane: Any, rays: Rays) -> Float[Array, "*n"]:
     """Return the distance to one plane (a row of Planes)."""
     point, normal = plane.point, plane.normal
     closing = rays.dx * normal[0] + rays.dy * normal[1] + rays.dz * normal[2]
@@ -41,7 +41,7 @@ def plane_distance(plane: Any, rays: Rays) -> Float[Array, " n"]:
     return jnp.where((distance > 0) & (jnp.abs(closing) > TINY), distance, jnp.inf)
 
 
-def ground_distance(ground: Any, rays: Rays) -> Float[Array, " n"]:
+def ground_distance(ground: Any, rays: Rays) -> Float[Array, "*n"]:
     """Return the distance to one height field (a row of Grounds).
 
     With F the ray's height above ground and c >= |F''| along it, nothing is met before
@@ -83,7 +83,7 @@ def ground_distance(ground: Any, rays: Rays) -> Float[Array, " n"]:
     return jnp.where(reached, distance, jnp.inf)
 
 
-def box_distance(box: Any, rays: Rays) -> Float[Array, " n"]:
+def box_distance(box: Any, rays: Rays) -> Float[Array, "*n"]:
     """Return the distance to one upright box (a row of Boxes); slab method."""
     cos, sin = jnp.cos(box.yaw), jnp.sin(box.yaw)
     east, north = rays.x - box.center[0], rays.y - box.center[1]
@@ -95,7 +95,7 @@ def box_distance(box: Any, rays: Rays) -> Float[Array, " n"]:
     return _first_of_interval(*slabs)
 
 
-def tilted_distance(box: Any, rays: Rays) -> Float[Array, " n"]:
+def tilted_distance(box: Any, rays: Rays) -> Float[Array, "*n"]:
     """Return the distance to one box in any attitude (a row of TiltedBoxes); slab method."""
     east, north, up = rays.x - box.center[0], rays.y - box.center[1], rays.z - box.center[2]
     slabs = (
@@ -109,7 +109,7 @@ def tilted_distance(box: Any, rays: Rays) -> Float[Array, " n"]:
     return _first_of_interval(*slabs)
 
 
-def moving_distance(moving: Any, rays: Rays) -> Float[Array, " n"]:
+def moving_distance(moving: Any, rays: Rays) -> Float[Array, "*n"]:
     """Return the distance to one moving box (a row of MovingBoxes) where it is when each ray is sent."""
     return box_distance(
         moving.boxes,
@@ -121,7 +121,7 @@ def moving_distance(moving: Any, rays: Rays) -> Float[Array, " n"]:
     )
 
 
-def cylinder_distance(cylinder: Any, rays: Rays) -> Float[Array, " n"]:
+def cylinder_distance(cylinder: Any, rays: Rays) -> Float[Array, "*n"]:
     """Return the distance to one solid cylinder (a row of Cylinders).
 
     The discriminant comes from the ray's closest approach to the axis, a r^2 - cross^2: the textbook
@@ -140,7 +140,7 @@ def cylinder_distance(cylinder: Any, rays: Rays) -> Float[Array, " n"]:
     return _first_of_interval(wall, _slab(rays.z - cylinder.base[2] - half, rays.dz, half))
 
 
-def sphere_distance(sphere: Any, rays: Rays) -> Float[Array, " n"]:
+def sphere_distance(sphere: Any, rays: Rays) -> Float[Array, "*n"]:
     """Return the distance to one ball (a row of Spheres); the discriminant from the closest approach."""
     x, y, z = sphere.center[0] - rays.x, sphere.center[1] - rays.y, sphere.center[2] - rays.z
     along = x * rays.dx + y * rays.dy + z * rays.dz
@@ -151,11 +151,11 @@ def sphere_distance(sphere: Any, rays: Rays) -> Float[Array, " n"]:
     return jnp.where((discriminant >= 0) & (distance > 0), distance, jnp.inf)
 
 
-def _away_from_zero(value: Float[Array, " n"]) -> Float[Array, " n"]:
+def _away_from_zero(value: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.where(jnp.abs(value) < TINY, TINY, value)
 
 
-def _sin_cos(angle: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+def _sin_cos(angle: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     """Return both, to 2e-14 for angles of some tens of radians: on a CPU ten times as fast as jnp.sin."""
     quarter = jnp.round(angle * (2 / jnp.pi))
     # pi/2 in three parts (Cody and Waite): small multiples of the first two are exact in float32
@@ -173,14 +173,14 @@ def _sin_cos(angle: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array
 
 
 def _slab(
-    offset: Float[Array, " n"], direction: Float[Array, " n"], half: Float[Array, ""]
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    offset: Float[Array, "*n"], direction: Float[Array, "*n"], half: Float[Array, ""]
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     inverse = 1 / _away_from_zero(direction)
     middle, reach = -offset * inverse, half * jnp.abs(inverse)
     return middle - reach, middle + reach
 
 
-def _first_of_interval(*intervals: tuple[Float[Array, " n"], Float[Array, " n"]]) -> Float[Array, " n"]:
+def _first_of_interval(*intervals: tuple[Float[Array, "*n"], Float[Array, "*n"]]) -> Float[Array, "*n"]:
     enter, leave = intervals[0]
     for start, end in intervals[1:]:
         enter, leave = jnp.maximum(enter, start), jnp.minimum(leave, end)

@@ -1,4 +1,8 @@
-"""One sweep of a LiDAR: every ray is cast from the pose that the sensor has at the ray's own firing time."""
+"""One sweep of a LiDAR: every ray is cast from the pose that the sensor has at the ray's own firing time.
+
+Directions, poses and ranges are float64 (call it in JAX's x64 mode, ``jax.enable_x64``): where a ray only
+grazes a surface, the last digit of a float32 in its direction is a millimetre of its range.
+"""
 
 from abc import abstractmethod
 
@@ -79,22 +83,25 @@ class Lidar(eqx.Module):
 class SpinningLidar(Lidar):
     """A head that turns clockwise seen from above, each sweep one turn from straight behind."""
 
-    elevation: Float[Array, " beams"]
+    elevation: tuple[float, ...] = eqx.field(static=True)
     """Above the sensor's xy plane, in firing order, rad."""
-    azimuth: Float[Array, " beams"]
+    azimuth: tuple[float, ...] = eqx.field(static=True)
     """Ahead of the head's own direction, counter-clockwise, in firing order, rad."""
 
     def phase(self, start_ns: int) -> Float[Array, "2"]:
         """Return zeros: every turn is alike."""
-        return jnp.zeros(2, jnp.float32)
+        return jnp.zeros(2)
 
     def directions(self, phase: Float[Array, "2"]) -> Float[Array, "columns beams 3"]:
         """Return the unit directions: the head turns on between the beams of a column, too."""
-        turned = outer_sum(column_times_ns(self) / self.period_ns, np.array(self.delay_ns) / self.period_ns)
-        azimuth = jnp.pi - 2 * jnp.pi * turned + self.azimuth
-        level = jnp.cos(self.elevation)
-        up = jnp.broadcast_to(jnp.sin(self.elevation), azimuth.shape)
-        return jnp.stack([jnp.cos(azimuth) * level, jnp.sin(azimuth) * level, up], axis=-1)
+        head = np.pi - 2 * np.pi * column_times_ns(self) / self.period_ns
+        beam = np.array(self.azimuth) - 2 * np.pi * np.array(self.delay_ns) / self.period_ns
+        level, up = np.cos(self.elevation), np.sin(self.elevation)
+        # by the angle sum, so that only column and beam are constants of a compiled program, not every ray
+        cos, sin = (jnp.asarray(part)[:, None] for part in (np.cos(head), np.sin(head)))
+        east, north = jnp.asarray(np.cos(beam) * level), jnp.asarray(np.sin(beam) * level)
+        x, y = cos * east - sin * north, sin * east + cos * north
+        return jnp.stack([x, y, jnp.broadcast_to(jnp.asarray(up), x.shape)], axis=-1)
 
 
 class Sweep(eqx.Module):
@@ -129,17 +136,15 @@ def spinning_lidar(
         min_range: m.
         max_range: m.
     """
-    elevation = jnp.linspace(
-        jnp.deg2rad(elevation_deg[0]), jnp.deg2rad(elevation_deg[1]), beams, dtype=jnp.float32
-    )
+    elevation = np.deg2rad(np.linspace(elevation_deg[0], elevation_deg[1], beams))
     return SpinningLidar(
         ranging=ranging(range_sigma, min_range, max_range),
         columns=columns,
         period_ns=round(1e9 / rate),
         delay_ns=(0,) * beams,
         ring=tuple(range(beams)),
-        elevation=elevation,
-        azimuth=jnp.zeros(beams, jnp.float32),
+        elevation=tuple(elevation.tolist()),
+        azimuth=(0.0,) * beams,
     )
 
 
@@ -159,11 +164,11 @@ def firing_times_ns(lidar: Lidar) -> NDArray[np.int64]:
 
 
 def outer_sum(of_column: NDArray[np.float64], of_beam: NDArray[np.float64]) -> Float[Array, "columns beams"]:
-    """Return the float32 sum of a quantity of the column and one of the beam.
+    """Return the sum of a quantity of the column and one of the beam.
 
-    Only the two factors become constants of a compiled program, not one number a ray.
+    Only the two summands become constants of a compiled program, not one number a ray.
     """
-    return jnp.asarray(of_column, jnp.float32)[:, None] + jnp.asarray(of_beam, jnp.float32)
+    return jnp.asarray(of_column)[:, None] + jnp.asarray(of_beam)
 
 
 def sweep(
@@ -177,15 +182,15 @@ def sweep(
 
     Args:
         lidar: the sensor.
-        part: of a world, placed at the sweep's start, float32, near the origin.
-        T_world_column: lidar pose at each column's time, batch (columns,), float32.
+        part: of a world, placed at the sweep's start, near the origin.
+        T_world_column: lidar pose at each column's time, batch (columns,).
         key: of this sweep's noise.
         phase: from ``lidar.phase``; None for a sensor whose sweeps are all alike.
 
     Returns:
         The sweep's points in the frame that the lidar had when each was measured.
     """
-    directions = lidar.directions(jnp.zeros(2, jnp.float32) if phase is None else phase)
+    directions = lidar.directions(jnp.zeros(2) if phase is None else phase)
     shape = directions.shape[:2]
     origins, rays = _rays(lidar, T_world_column, directions)
     time = outer_sum(column_times(lidar), np.array(lidar.delay_ns) * 1e-9)
@@ -200,7 +205,11 @@ def sweep(
     noise = model.sigma * jax.random.normal(key, mask.shape, jnp.float32)
     measured = jnp.where(mask, hit.distance + noise, 0)
     intensity = jnp.where(mask, jnp.round(255 * answer), 0)
-    return Sweep(measured.reshape(*shape, 1) * directions, intensity.reshape(shape), mask.reshape(shape))
+    points, intensity = (
+        values.astype(jnp.float32)
+        for values in (measured.reshape(*shape, 1) * directions, intensity.reshape(shape))
+    )
+    return Sweep(points, intensity, mask.reshape(shape))
 
 
 def _rays(
@@ -213,7 +222,7 @@ def _rays(
     """
     rotation = T_world_column.rotation().as_matrix()
     position = T_world_column.translation()
-    share = jnp.asarray(np.array(lidar.delay_ns) * lidar.columns / lidar.period_ns, jnp.float32)
+    share = jnp.asarray(np.array(lidar.delay_ns) * lidar.columns / lidar.period_ns)
     origins = position[:, None] + share[:, None] * _step(position)[:, None]
     rays = _turned(rotation, directions) + share[:, None] * _turned(_step(rotation), directions)
     return origins.reshape(-1, 3), rays.reshape(-1, 3)

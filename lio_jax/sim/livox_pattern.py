@@ -22,16 +22,16 @@ class RosetteLidar(Lidar):
 
     prism_mhz: tuple[int, int] = eqx.field(static=True)
     """Turns of the prisms in 1000 s, counter-clockwise seen along +x."""
-    radius: Float[Array, ""]
+    radius: float = eqx.field(static=True)
     """Half the angle of the field of view, of one line, rad."""
-    fan: Float[Array, " beams"]
+    fan: tuple[float, ...] = eqx.field(static=True)
     """Upward tilt of each line, in firing order, rad."""
 
     def phase(self, start_ns: int) -> Float[Array, "2"]:
         """Return how far each prism has turned beyond whole turns, (2,) turns."""
         # the start in Python's unbounded integers: exact however long the recording
         turned = [start_ns * rate % _MILLIHERTZ_NS / _MILLIHERTZ_NS for rate in self.prism_mhz]
-        return jnp.array(turned, jnp.float32)
+        return jnp.array(turned)
 
     def directions(self, phase: Float[Array, "2"]) -> Float[Array, "columns beams 3"]:
         """Return the unit directions: the angles measured from +x, towards +y and +z."""
@@ -41,7 +41,7 @@ class RosetteLidar(Lidar):
             for number, rate in enumerate(self.prism_mhz)
         )
         across = 0.5 * self.radius * (jnp.cos(first) + jnp.cos(second))
-        upwards = 0.5 * self.radius * (jnp.sin(first) + jnp.sin(second)) + self.fan
+        upwards = 0.5 * self.radius * (jnp.sin(first) + jnp.sin(second)) + jnp.asarray(self.fan)
         angle = jnp.hypot(across, upwards)
         sideways = jnp.sinc(angle / jnp.pi)
         return jnp.stack([jnp.cos(angle), across * sideways, upwards * sideways], axis=-1)

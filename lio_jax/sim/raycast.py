@@ -1,17 +1,15 @@
 """Analytic ray casting: the first surface that each ray meets.
 
-A scan over primitives with a running minimum over rays: memory grows with the rays alone, and each step is
-one fused, vectorised pass. Surfaces are seen from both sides, so a ray may start inside a solid.
+Surfaces are seen from both sides, so a ray may start inside a solid. Memory grows with the rays alone.
 """
-
-from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
+from lio_jax.sim.first_met import Kind, first_met
+from lio_jax.sim.growth import box_grown, cylinder_grown, endless_grown, moving_grown, sphere_grown
 from lio_jax.sim.intersect import (
     Rays,
     box_distance,
@@ -50,6 +48,8 @@ def cast(
 ) -> Hit:
     """Return the first hit of each ray.
 
+    Distances are as exact as the rays' precision allows, however flat a surface is met or closely missed.
+
     Args:
         part: of a world, of the same dtype as the rays.
         origins: in the part's frame, m.
@@ -62,58 +62,45 @@ def cast(
     x, y, z = origins.T
     dx, dy, dz = directions.T
     rays = Rays(x, y, z, dx, dy, dz, time)
-    solids = part.solids
-    kinds: list[tuple[Any, Callable[..., Array], Callable[..., Array]]] = [
-        (solids.planes, plane_distance, plane_normal),
-        (solids.grounds, ground_distance, ground_normal),
-        (solids.boxes, box_distance, box_normal),
-        (solids.tilted, tilted_distance, tilted_normal),
-        (solids.cylinders, cylinder_distance, cylinder_normal),
-        (solids.spheres, sphere_distance, sphere_normal),
-        (part.moving, moving_distance, moving_normal),
-    ]
-    best = jnp.full(rays.x.shape, jnp.inf, rays.x.dtype)
-    normal = jnp.zeros_like(directions)
-    reflectivity = jnp.zeros_like(best)
-    for primitives, distance_to, normal_at in kinds:
-        if primitives.reflectivity.shape[0] == 0:
-            continue
-        distance, index = _nearest(primitives, rays, distance_to)
-        closer = distance < best
-        best = jnp.minimum(distance, best)
+    kinds = _kinds(part)
+    if not kinds:
+        nothing = jnp.zeros_like(rays.x)
+        return Hit(nothing + jnp.inf, jnp.zeros_like(directions), nothing)
+    distance, number = first_met(kinds, rays)
+    first, best = jnp.argmin(distance, axis=0), jnp.min(distance, axis=0)
+    normal, reflectivity = jnp.zeros_like(directions), jnp.zeros_like(best)
+    for place, kind in enumerate(kinds):
+        seen = (first == place) & jnp.isfinite(best)
 
-        def seen(
+        def surface(
             normal: Array,
             reflectivity: Array,
-            primitives: Any = primitives,
-            normal_at: Callable[..., Array] = normal_at,
-            closer: Array = closer,
-            index: Array = index,
-            best: Array = best,
+            kind: Kind = kind,
+            which: Array = number[place],
+            seen: Array = seen,
         ) -> tuple[Array, Array]:
-            met = jax.tree.map(lambda leaf: leaf[index], primitives)
-            point = origins + jnp.where(closer, best, 0)[:, None] * directions
-            own = normal_at(met, point, time)
-            return jnp.where(closer[:, None], own, normal), jnp.where(closer, met.reflectivity, reflectivity)
+            met = jax.tree.map(lambda leaf: leaf[which], kind.rows)
+            point = origins + jnp.where(seen, best, 0)[:, None] * directions
+            own = kind.normal(met, point, time)
+            return jnp.where(seen[:, None], own, normal), jnp.where(seen, met.reflectivity, reflectivity)
 
         # the branch also keeps XLA from fusing all kinds into one pass, which computes each many times over
         normal, reflectivity = jax.lax.cond(
-            jnp.any(closer), seen, lambda *unchanged: unchanged, normal, reflectivity
+            jnp.any(seen), surface, lambda *unchanged: unchanged, normal, reflectivity
         )
     away = jnp.sum(normal * directions, axis=1) > 0
     return Hit(best, jnp.where(away[:, None], -normal, normal), reflectivity)
 
 
-def _nearest(
-    primitives: Any, rays: Rays, distance_to: Callable[..., Array]
-) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
-    def closer_of(best: tuple[Array, Array], item: tuple[Array, Any]) -> tuple[tuple[Array, Array], None]:
-        index, primitive = item
-        distance = distance_to(primitive, rays)
-        closer = distance < best[0]
-        return (jnp.where(closer, distance, best[0]), jnp.where(closer, index, best[1])), None
-
-    count = primitives.reflectivity.shape[0]
-    start = (jnp.full(rays.x.shape, jnp.inf, rays.x.dtype), jnp.zeros(rays.x.shape, jnp.int32))
-    items = (jnp.arange(count, dtype=jnp.int32), primitives)
-    return jax.lax.scan(closer_of, start, items, unroll=min(2, count))[0]
+def _kinds(part: Part) -> list[Kind]:
+    solids = part.solids
+    kinds = [
+        Kind(solids.planes, plane_distance, plane_normal, endless_grown),
+        Kind(solids.grounds, ground_distance, ground_normal, endless_grown),
+        Kind(solids.boxes, box_distance, box_normal, box_grown),
+        Kind(solids.tilted, tilted_distance, tilted_normal, box_grown),
+        Kind(solids.cylinders, cylinder_distance, cylinder_normal, cylinder_grown),
+        Kind(solids.spheres, sphere_distance, sphere_normal, sphere_grown),
+        Kind(part.moving, moving_distance, moving_normal, moving_grown),
+    ]
+    return [kind for kind in kinds if kind.size]

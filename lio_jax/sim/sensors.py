@@ -1,10 +1,10 @@
 """The sensors that can be simulated, by name, with the geometry of their data sheets."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -78,8 +78,8 @@ def livox() -> RosetteLidar:
         delay_ns=tuple(25_000 * line // lines for line in range(lines)),
         ring=tuple(range(lines)),
         prism_mhz=(121_570, -77_730),
-        radius=jnp.float32(np.deg2rad(35.2)),
-        fan=jnp.asarray(fan, jnp.float32),
+        radius=math.radians(35.2),
+        fan=tuple(fan.tolist()),
     )
 
 
@@ -136,6 +136,6 @@ def _spinning(
         period_ns=_TURN_NS,
         delay_ns=tuple(int(delay) for delay in delay_ns),
         ring=tuple(int(number) for number in ring),
-        elevation=jnp.asarray(np.deg2rad(elevation), jnp.float32),
-        azimuth=jnp.asarray(np.deg2rad(offset), jnp.float32),
+        elevation=tuple(np.deg2rad(elevation).tolist()),
+        azimuth=tuple(np.deg2rad(offset).tolist()),
     )

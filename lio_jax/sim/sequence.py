@@ -219,7 +219,8 @@ class SimulatedSequence:
         # what is driven between the samples, and within a sweep that starts at one
         margin = 2 * driven + lever + 1.0
         radius = float(self.lidar.ranging.maximum + margin)
-        counts = counts_along(self.world, jnp.asarray(sampled, jnp.float32), radius)
+        with jax.enable_x64(True):
+            counts = counts_along(self.world, jnp.asarray(sampled), radius)
         return Counts(*(_rounded_up(int(count)) for count in counts))
 
 
@@ -278,19 +279,16 @@ def _surroundings(
     lidar: Lidar,
     counts: Counts,
 ) -> tuple[Part, jaxlie.SE3]:
-    """Return what is in range and the lidar poses at the columns' times, float32.
+    """Return what is in range and the lidar poses at the columns' times.
 
-    Both are relative to where the lidar is at the sweep's start, and rounded only then: float32 holds a
-    distance of 100 m to 1e-5 m, but not a coordinate in a large world.
+    Both are relative to where the lidar is at the sweep's start, as rays are cast best near the origin.
     """
     times = start + jnp.asarray(column_times(lidar))
     poses = jax.vmap(lambda time: pose_at(motion, time) @ T_imu_lidar)(times)
     center = poses.translation()[0]
     local = jaxlie.SE3.from_rotation_and_translation(poses.rotation(), poses.translation() - center)
     part, _ = nearest_part(world, center, start, counts)
-    return jax.tree.map(
-        lambda leaf: leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf, (part, local)
-    )
+    return part, local
 
 
 @eqx.filter_jit

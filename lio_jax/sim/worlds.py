@@ -53,11 +53,11 @@ def nearest_part(
 ) -> tuple[Part, Float[Array, ""]]:
     """Return planes, grounds, movers and the nearest other solids, moved so that ``position`` is the origin.
 
-    Casting near the origin keeps float32 ranges exact; leaving far solids out makes casting cheap.
+    Near the origin float32 tells best which solid a ray meets; leaving far solids out makes casting cheap.
 
     Args:
         world: everything.
-        position: world frame, m, in the world's dtype; rays are stated relative to this rounded value.
+        position: world frame, m; rays are stated relative to it.
         time: where the movers are placed, s from the recording's start.
         counts: numbers of solids kept, static.
 

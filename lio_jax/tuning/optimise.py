@@ -17,9 +17,11 @@ Evaluate = Callable[[Vector], Evaluated]
 
 _LARGEST_STEP = 1.0
 """Of a component in one scoring step: a factor e of a positive parameter."""
-_LARGEST_SCALE = 300.0
+_SMALLEST_SCALE, _LARGEST_SCALE = 0.1, 300.0
 _DAMPING = 0.02
 """Of the information's diagonal."""
+_LEAST_CURVATURE = 1.0
+"""What every component has at least: one that the recordings tell nothing of stays where it is."""
 
 
 class Bounds(NamedTuple):
@@ -48,10 +50,10 @@ def scoring(evaluate: Evaluate, x: Vector, bounds: Bounds, iterations: int) -> N
             stride, before = last
             curvature = stride @ (gradient - before)
             measured = stride @ information @ stride / curvature if curvature > 0 else 2 * scale
-            scale = float(np.clip(measured, 0.5, _LARGEST_SCALE))
-        damped = information + _DAMPING * np.diag(np.diag(information))
-        step = np.asarray(-scale * np.linalg.solve(damped, gradient), np.float64)
-        step = step * min(1.0, _LARGEST_STEP / max(np.abs(step).max(), 1e-300))
+            scale = float(np.clip(measured, _SMALLEST_SCALE, _LARGEST_SCALE))
+        curvature = information / scale
+        damped = curvature + np.diag(_DAMPING * np.diag(curvature) + _LEAST_CURVATURE)
+        step = np.clip(-np.linalg.solve(damped, gradient), -_LARGEST_STEP, _LARGEST_STEP)
         step = np.asarray(bounds.clip(x + step) - x, np.float64)
         free = np.abs(step) > 0
         shift = gradient[free]

@@ -83,7 +83,9 @@ def test_zero_is_impossible_where_it_divides(path):
     assert invalid_value(path, 0.0) == "must be greater than zero"
 
 
-@pytest.mark.parametrize("path", ["motion.error_decay", "registration.degeneracy_ratio"])
+@pytest.mark.parametrize(
+    "path", ["motion.error_decay", "registration.degeneracy_ratio", "registration.inertial_degeneracy_ratio"]
+)
 def test_fraction_is_at_most_one(path):
     assert invalid_value(path, 1.0) == ""
     assert invalid_value(path, 1.01) == "must be at most 1"

@@ -15,6 +15,7 @@ from lio_jax.core.error_state import (
     GRAVITY,
     ROTATION,
     TIME_OFFSET,
+    Swept,
     Uncertain,
     local,
     retract,
@@ -50,7 +51,7 @@ def update_by_pose(
     def measure(nav: NavState) -> Measurement:
         return measured_pose(nav, T_world_lidar, information)
 
-    return update_nav(prior, measure, max_iterations=iterations, **TOLERANCES)
+    return update_nav(Swept.at_once(prior), measure, max_iterations=iterations, **TOLERANCES)[0]
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 
-from lio_jax.core.error_state import DOF, Uncertain, local, retract
+from lio_jax.core.error_state import DOF, Swept, Uncertain, local, retract
 from lio_jax.core.params import ImuParams
 from lio_jax.core.types import ImuBatch, NavState
 from lio_jax.estimation.iterated_filter import Update
@@ -118,8 +118,8 @@ def run(key: jax.Array, sigma: jax.Array, true: Truth) -> tuple[jax.Array, Updat
         measured = jaxlie.SE3.from_rotation_and_translation(
             turned, T.translation() - turned @ pose_noise[scan, 3:]
         )
-        update = update_nav(
-            predicted,
+        update, _ = update_nav(
+            Swept.at_once(predicted),
             lambda trial: measured_pose(trial, measured, information),
             max_iterations=10,
             rotation_tolerance=jnp.array(1e-6),

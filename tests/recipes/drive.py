@@ -71,7 +71,8 @@ def _measured(number: int, twist: tuple[float, ...], still: bool) -> tuple[np.nd
     if still:
         times = np.full_like(times, (number + 1) * PERIOD)
     poses = np.stack([lidar_pose(t, np.array(twist)) for t in times])
-    points, mask = _turn(jnp.asarray(poses, jnp.float32), jax.random.key(number))
+    with jax.enable_x64(True):
+        points, mask = _turn(jnp.asarray(poses, jnp.float32), jax.random.key(number))
     return np.asarray(points), np.asarray(mask)
 
 

@@ -21,7 +21,7 @@ def test_rate_and_field_of_view_are_those_of_an_avia():
     directions, across, upwards = _directions(0)
     assert directions.shape == (4000, 6, 3)
     assert directions.shape[0] * directions.shape[1] / LIDAR.period == pytest.approx(240_000)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, atol=1e-12)
     np.testing.assert_allclose([np.ptp(across), np.ptp(upwards)], [70.4, 77.2], atol=0.5)
     assert np.abs(across).max() <= 35.2 + 1e-3
     assert np.abs(upwards).max() <= 38.6 + 1e-3
@@ -36,9 +36,9 @@ def test_two_prisms_steer_the_beam(number):
     time = time + LIDAR.delay_ns[line] * 1e-9
     turns = [rate * 1e-3 for rate in LIDAR.prism_mhz]
     steered = 17.6 * sum(np.exp(2j * np.pi * rate * time) for rate in turns)
-    np.testing.assert_allclose(across[:, line], steered.real, atol=2e-3)
-    fan = np.rad2deg(float(LIDAR.fan[line]))
-    np.testing.assert_allclose(upwards[:, line], steered.imag + fan, atol=2e-3)
+    np.testing.assert_allclose(across[:, line], steered.real, atol=1e-5)
+    fan = np.rad2deg(LIDAR.fan[line])
+    np.testing.assert_allclose(upwards[:, line], steered.imag + fan, atol=1e-5)
 
 
 def test_each_sweep_fills_in_what_the_last_left_out():

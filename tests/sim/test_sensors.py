@@ -49,15 +49,15 @@ def test_rings_are_those_that_a_loam_reconstructs_from_elevation(lidars, name, b
 
 def test_hdl64_has_two_blocks_of_different_spacing(lidars):
     elevation = np.sort(np.rad2deg(np.asarray(lidars["hdl64"].elevation, float)))[::-1]
-    np.testing.assert_allclose(np.diff(elevation[:32]), -1 / 3, atol=1e-4)
-    np.testing.assert_allclose(np.diff(elevation[32:]), -1 / 2, atol=1e-4)
-    np.testing.assert_allclose(elevation[32], -8.83, atol=1e-4)
+    np.testing.assert_allclose(np.diff(elevation[:32]), -1 / 3, atol=1e-9)
+    np.testing.assert_allclose(np.diff(elevation[32:]), -1 / 2, atol=1e-9)
+    np.testing.assert_allclose(elevation[32], -8.83, atol=1e-9)
 
 
 def test_vlp16_fires_low_and_high_beams_in_turn(lidars):
     lidar = lidars["vlp16"]
     expected = [-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15]
-    np.testing.assert_allclose(np.rad2deg(lidar.elevation), expected, atol=1e-4)
+    np.testing.assert_allclose(np.rad2deg(lidar.elevation), expected, atol=1e-9)
     np.testing.assert_array_equal(np.diff(lidar.delay_ns), 2304)
 
 
@@ -87,14 +87,14 @@ def test_the_head_turns_clockwise_once_between_all_rays(lidars, name):
     lidar = lidars[name]
     directions = np.asarray(lidar.directions(lidar.phase(0)), float)
     assert directions.shape == (lidar.columns, lidar.beams, 3)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, atol=1e-12)
     np.testing.assert_allclose(
-        directions[..., 2], np.sin(lidar.elevation)[None].repeat(lidar.columns, 0), atol=1e-6
+        directions[..., 2], np.sin(lidar.elevation)[None].repeat(lidar.columns, 0), atol=1e-12
     )
     turned = 2 * np.pi * firing_times_ns(lidar) / lidar.period_ns
     azimuth = np.pi - turned + np.asarray(lidar.azimuth)
     found = np.arctan2(directions[..., 1], directions[..., 0])
-    assert np.abs(np.angle(np.exp(1j * (found - azimuth)))).max() < 2e-6
+    assert np.abs(np.angle(np.exp(1j * (found - azimuth)))).max() < 1e-12
 
 
 def test_layouts():
