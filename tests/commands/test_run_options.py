@@ -238,7 +238,7 @@ def test_unknown_recipe(folder, cli, tmp_path):
     done = cli("run", folder, "--out", tmp_path / "out", "--recipe", "fast_lio3")
     assert done.status == 2
     assert (
-        "recipe 'fast_lio3' is not known; there are: default, fast_lio2; or give a settings file *.yaml."
+        "recipe 'fast_lio3' is not known; there are: default, fast_lio2, loam; or give a settings file *.yaml."
         in done.err
     )
 
