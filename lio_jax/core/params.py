@@ -113,7 +113,7 @@ class ScanToScanParams(eqx.Module):
     radius: Scalar
     """Matched points have to be nearer than this, m."""
     rings_apart: Scalar
-    """Of a match's points the others are fewer rings than this away from the nearest one's."""
+    """Of a match's points the others are fewer rings than this away from the nearest one's; at most 3."""
 
 
 class KnnParams(eqx.Module):
@@ -387,6 +387,8 @@ def invalid_value(path: str, value: Any) -> str:
         return "" if abs(norm - 1) < 1e-3 else f"must be a unit quaternion x y z w (its norm is {norm:.4g})"
     if path in _AT_MOST_ONE and value > 1:
         return "must be at most 1"
+    if path == "scan_to_scan.rings_apart" and value > 3:
+        return "must be at most 3"
     if path in _MAY_BE_ZERO:
         return "" if value >= 0 else "must not be negative"
     return "" if value > 0 else "must be greater than zero"
