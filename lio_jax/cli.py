@@ -139,6 +139,33 @@ def evaluate(
     command(estimate, reference, json)
 
 
+@app.command(name="export")
+def export(
+    data: Data,
+    to: Literal["bag", "kitti", "native"],
+    out: Annotated[Path, arg(metavar="PATH")],
+    set_: Assignments = (),
+    layout: Annotated[str, arg(metavar="MAKE")] = "velodyne",
+    start: Annotated[int, arg(metavar="N")] = 0,
+    scans: Annotated[int | None, arg(metavar="N")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a recording in another format: ROS bag, KITTI odometry sequence or native folder.
+
+    Args:
+        data: Recording: KITTI folder, ROS bag or native folder.
+        to: Format.
+        out: What to write: *.bag (ROS 1), *.mcap or *.db3 (ROS 2); else a folder.
+        layout: Make of the LiDAR whose messages a bag gets: velodyne, ouster or livox.
+        start: First scan.
+        scans: How many scans; None means all.
+        overwrite: Replace the recording that is there.
+    """
+    from lio_jax.commands.export import export as command
+
+    command(data, to, out, set_, layout, start, scans, overwrite)
+
+
 @app.command(name="tune")
 def tune(
     data: Positional[Annotated[tuple[Path, ...], arg(metavar="DATA [DATA ...]")]],

@@ -195,7 +195,24 @@ class Dlio(EvalioPipeline):
 
 
 def _measurement(scan: LidarScan, rig: Rig) -> Any:
-    """Return the scan as evalio wants it: row by row, rays without a return as zeros."""
+    """Return the scan as evalio wants it, each ray in the column it was fired in."""
+    # float32 seconds: half a microsecond keeps a ray in its column
+    column = np.floor((scan.time.astype(np.float64) + 5e-7) / (scan.duration / rig.columns)).astype(np.intp)
+    return measurement(scan, column, np.ones(len(column), bool), rig.beams, rig.columns)
+
+
+def measurement(
+    scan: LidarScan, column: NDArray[np.intp], kept: NDArray[np.bool_], beams: int, columns: int
+) -> Any:
+    """Return the scan as evalio wants it: row by row, rays without a return as zeros.
+
+    Args:
+        scan: as recorded.
+        column: of each point; those beyond the last one fall into it.
+        kept: which points are handed on.
+        beams: rows.
+        columns: of a row.
+    """
     from evalio._cpp.helpers import (
         DataType,
         Field,
@@ -210,18 +227,17 @@ def _measurement(scan: LidarScan, rig: Rig) -> Any:
     fields |= {"ring": DataType.UINT16}
     kinds = {DataType.FLOAT32: np.float32, DataType.UINT32: np.uint32, DataType.UINT16: np.uint16}
     layout = np.dtype([(name, kinds[kind]) for name, kind in fields.items()])
-    grid = np.zeros((rig.beams, rig.columns), layout)
-    period = scan.duration / rig.columns
-    grid["t"] = np.round(1e9 * period * np.arange(rig.columns)).astype(np.uint32)
-    grid["ring"] = np.arange(rig.beams)[:, None]
-    # float32 seconds: half a microsecond keeps a ray in the column it was fired in
-    column = np.floor((scan.time.astype(np.float64) + 5e-7) / period).astype(np.intp)
-    place = scan.ring, np.minimum(column, rig.columns - 1)
+    grid = np.zeros((beams, columns), layout)
+    period = scan.duration / columns
+    grid["t"] = np.round(1e9 * period * np.arange(columns)).astype(np.uint32)
+    grid["ring"] = np.arange(beams)[:, None]
+    place = scan.ring[kept], np.minimum(column[kept], columns - 1)
+    points = scan.points[kept]
     for axis, name in enumerate("xyz"):
-        grid[name][place] = scan.points[:, axis]
-    grid["intensity"][place] = scan.intensity
-    grid["t"][place] = np.round(scan.time.astype(np.float64) * 1e9).astype(np.uint32)
-    grid["range"][place] = np.round(1e3 * np.linalg.norm(scan.points, axis=1)).astype(np.uint32)
+        grid[name][place] = points[:, axis]
+    grid["intensity"][place] = scan.intensity[kept]
+    grid["t"][place] = np.round(scan.time[kept].astype(np.float64) * 1e9).astype(np.uint32)
+    grid["range"][place] = np.round(1e3 * np.linalg.norm(points, axis=1)).astype(np.uint32)
     cloud = PointCloudMetadata(
         stamp=Stamp.from_nsec(scan.stamp_ns),
         width=grid.size,

@@ -1,4 +1,4 @@
-"""Compare our LiDAR odometry with kiss-icp and small_gicp: time per scan and error, same scans, one run.
+"""Compare our LiDAR odometry with kiss-icp, small_gicp and LOAM: time per scan and error on the same scans.
 
     python experiments/bench/lidar_vs_peers.py [--kitti-odometry DIR] [--kitti-raw DIR] [--json]
 
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from interleaved import Record
     from systems import System
 
-OURS = "lio_jax"
-PEER_NAMES = ("kiss-icp", "small_gicp", "kiss-icp-no-deskew")
+OURS = {"lio_jax": "default", "lio_jax-loam": "loam"}
+"""Our systems and their recipes."""
+PEER_NAMES = ("kiss-icp", "small_gicp", "kiss-icp-no-deskew", "evalio-loam")
 
 
 def main() -> None:
@@ -68,8 +69,8 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--scans", type=int, help="number of scans (default: all; street: 200)")
     parser.add_argument(
         "--systems",
-        default=",".join((OURS, *PEER_NAMES[:2])),
-        help=f"comma separated, of: {OURS}, {', '.join(PEER_NAMES)}",
+        default=",".join((*OURS, *PEER_NAMES[:2])),
+        help=f"comma separated, of: {', '.join((*OURS, *PEER_NAMES))}",
     )
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="settings of ours")
     parser.add_argument("--repeats", type=int, default=1, help="passes over each recording")
@@ -80,9 +81,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--json", action="store_true", help="one JSON object on the last line")
     options = parser.parse_args()
     options.systems = options.systems.split(",")
-    if unknown := set(options.systems) - {OURS, *PEER_NAMES}:
+    if unknown := set(options.systems) - {*OURS, *PEER_NAMES}:
         parser.error(
-            f"unknown system {', '.join(sorted(unknown))}; choose from {OURS}, {', '.join(PEER_NAMES)}"
+            f"unknown system {', '.join(sorted(unknown))}; choose from {', '.join((*OURS, *PEER_NAMES))}"
         )
     return options
 
@@ -104,10 +105,13 @@ def _factories(options: argparse.Namespace, dataset: "Dataset") -> "dict[str, Ca
     makers: dict[str, Callable[[], System]] = {
         name: partial(maker, options.threads) for name, maker in PEERS.items()
     }
-    if OURS in options.systems:
-        from lio_jax_system import LioJaxSystem
+    for name in set(OURS) & set(options.systems):
+        from lio_jax_system import LioJaxSystem, sizes_for
 
-        makers[OURS] = partial(LioJaxSystem, options.threads, dataset.T_imu_lidar, tuple(options.set))
+        overrides = (*sizes_for(OURS[name], dataset.scans), *options.set)
+        makers[name] = partial(
+            LioJaxSystem, options.threads, dataset.T_imu_lidar, overrides, None, OURS[name]
+        )
     return {name: makers[name] for name in options.systems}
 
 

@@ -13,6 +13,7 @@ from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, wi
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.run.feed import bucket_for
 from lio_jax.run.run import imu_feed
+from lio_jax.run.sensor_sizes import with_sensor_sizes
 from lio_jax.run.track import CompiledStep, track
 
 _OPENING = 3
@@ -71,6 +72,17 @@ class LioJaxSystem:
     def _feed(self) -> Iterator[LidarScan]:
         while True:
             yield self._pending
+
+
+def sizes_for(recipe: str, scans: list[LidarScan]) -> tuple[str, ...]:
+    """Return the sizes that the scans decide where a recipe leaves them open, as overrides."""
+    settings = recipe_settings(recipe)
+    fitting = with_sensor_sizes(settings, scans)[0].config.features
+    return tuple(
+        f"config.features.{name}={value}"
+        for name, value in vars(fitting).items()
+        if value != getattr(settings.config.features, name)
+    )
 
 
 @cache

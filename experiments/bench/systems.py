@@ -116,7 +116,55 @@ class SmallGicp:
         return self._pose
 
 
+class EvalioLoam:
+    """The LOAM that evalio ships, with its defaults: it matches with three scans and does not deskew."""
+
+    name: ClassVar[str] = "evalio-loam"
+    instant: ClassVar[float] = 0.5
+    instant_reason: ClassVar[str] = (
+        "no deskewing: a moving sensor's points fit best at the middle of the scan"
+    )
+    _COLUMNS = 2048
+
+    def __init__(self, threads: int) -> None:
+        from evalio import pipelines
+        from evalio.types import SE3, ImuParams
+
+        self._pose: Pose = np.eye(4)
+        self._pipeline = pipelines.LOAM()
+        self._pipeline.set_params(self._pipeline.default_params())
+        self._pipeline.set_imu_params(ImuParams())
+        self._pipeline.set_imu_T_lidar(SE3.identity())
+        self._beams = 0
+
+    def warm_up(self, scans: list[LidarScan]) -> None:
+        for scan in scans[:2]:
+            self.register(self.prepare(scan))
+
+    def prepare(self, scan: LidarScan) -> Any:
+        from inertial_peers import measurement
+
+        if not self._beams:
+            from evalio.types import LidarParams
+
+            self._beams = 16 * (int(scan.ring.max()) // 16 + 1)
+            self._pipeline.set_lidar_params(
+                LidarParams(num_rows=self._beams, num_columns=self._COLUMNS, min_range=1.0, max_range=200.0)
+            )
+            self._pipeline.initialize()
+        azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0]).astype(np.float64)
+        column = np.floor((0.5 - azimuth / (2 * np.pi)) * self._COLUMNS).astype(np.intp)
+        kept = scan.ring >= 0
+        return measurement(scan, column, kept, self._beams, self._COLUMNS)
+
+    def register(self, prepared: Any) -> Pose:
+        self._pipeline.add_lidar(prepared)
+        for _, pose in self._pipeline.saved_estimates():
+            self._pose = pose.to_mat()
+        return self._pose
+
+
 PEERS: dict[str, Callable[[int], System]] = {
-    system.name: system for system in (KissIcp, KissIcpNoDeskew, SmallGicp)
+    system.name: system for system in (KissIcp, KissIcpNoDeskew, SmallGicp, EvalioLoam)
 }
 """Name to factory: ``factory(threads)``."""

@@ -94,11 +94,13 @@ class FeaturesConfig:
     """Corners and flat points along the sensor's rings."""
 
     rings: int = 64
-    """Rings of the sensor; points of a ring beyond are reported as dropped."""
+    """Rings of the sensor; points of a ring beyond are reported as dropped. 0: by the recording's first
+    scan."""
     ring_step: int = 1
     """Every how many rings one is used."""
     columns: int = 2304
-    """Columns of a full turn where points are ordered by azimuth; else the points a ring has room for."""
+    """Columns of a full turn where points are ordered by azimuth; else the points a ring has room for. 0: by
+    the recording's first scan."""
     order: Literal["arrival", "azimuth"] = "arrival"
     """How a ring's points follow each other: as the recording has them (A-LOAM; the lines of a Livox), or by
     columns of equal azimuth, of which the first point takes each (LIO-SAM)."""
@@ -114,7 +116,7 @@ class FeaturesConfig:
     flat: int = 4
     """Flattest points of a sector, which are matched against the surfaces."""
     surface_points: int = 49152
-    """Capacity of the downsampled surface points."""
+    """Capacity of the downsampled surface points. 0: by the recording's first scan."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,25 @@ class FastLio2Config:
     point_filter_num: int = 3
     """Every how many points of a scan one is used, counted in the recording's order: a divisor of the beams'
     number would leave whole beams out where the points of a firing follow each other."""
+
+
+@dataclass(frozen=True)
+class LoamConfig:
+    """What the recipe loam has of its own."""
+
+    rounds: int = 2
+    """How often a scan's matches are searched; each time ``config.registration.max_iterations`` steps follow
+    at most."""
+    opening_rounds: int = 15
+    """Takes the place of ``rounds`` between the first two scans: no velocity is known there."""
+    compensate: bool = True
+    """Compensate the motion within a scan, as the pose under trial implies it."""
+    mapping_every: int = 1
+    """Every how many scans one is matched with the map and added to it."""
+    corner_points: int = 4096
+    """Capacity of the corners that are matched with the map, after thinning."""
+    surface_points: int = 8192
+    """Capacity of the surface points that are matched with the map, after thinning."""
 
 
 @dataclass(frozen=True)
@@ -154,10 +175,17 @@ class Config:
     knn: KnnConfig = field(default_factory=KnnConfig)
     features: FeaturesConfig = field(default_factory=FeaturesConfig)
     fast_lio2: FastLio2Config = field(default_factory=FastLio2Config)
+    loam: LoamConfig = field(default_factory=LoamConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
 
 
-_MAY_BE_ZERO = {"config.data.beams", "config.data.prefetch"}
+_MAY_BE_ZERO = {
+    "config.data.beams",
+    "config.data.prefetch",
+    "config.features.rings",
+    "config.features.columns",
+    "config.features.surface_points",
+}
 
 
 def invalid_config(path: str, value: object) -> str:

@@ -42,7 +42,7 @@ def eigenvalues_and_normal3(
             jnp.stack([by * bz - yz**2, yz * xz - xy * bz, xy * yz - by * xz], -1),
         )
     )
-    u, v = _across(axis)
+    u, v = across(axis)
 
     def form(left: Array, right: Array) -> Array:
         (lx, ly, lz), (rx, ry, rz) = jnp.moveaxis(left, -1, 0), jnp.moveaxis(right, -1, 0)
@@ -63,7 +63,7 @@ def eigenvalues_and_normal3(
     return mean[..., None] + p[..., None] * values, normal
 
 
-def _across(axis: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
+def across(axis: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
     """Return two unit vectors that are perpendicular to a unit vector and to each other."""
     x, y, z = jnp.moveaxis(axis, -1, 0)
     zero = jnp.zeros_like(x)

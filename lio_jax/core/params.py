@@ -73,6 +73,8 @@ class MapParams(eqx.Module):
 
     voxel_size: Scalar
     """Edge length of a voxel, m."""
+    corner_voxel_size: Scalar
+    """Likewise in the map of corners, where there is one, m."""
     point_spacing: Scalar
     """The scan is thinned to one point per cube of this edge before it enters the map, m."""
     min_points: Scalar
@@ -87,7 +89,7 @@ class RegistrationParams(eqx.Module):
     point_spacing: Scalar
     """The scan is thinned to one point per cube of this edge before it is matched, m."""
     kernel: Scalar
-    """Scale of the Geman-McClure kernel, m."""
+    """Scale of the robust kernel, m: Geman-McClure's; in loam Huber's."""
     information_scale: Scalar
     """Share of the matches' information that the filter believes: neighbours share the map's error."""
     reassociation_distance: Scalar
@@ -105,13 +107,24 @@ class RegistrationParams(eqx.Module):
     """Matched points below which a scan counts as lost."""
 
 
+class ScanToScanParams(eqx.Module):
+    """Matches of a scan with the one before it."""
+
+    radius: Scalar
+    """Matched points have to be nearer than this, m."""
+    rings_apart: Scalar
+    """Of a match's points the others are fewer rings than this away from the nearest one's; at most 3."""
+
+
 class KnnParams(eqx.Module):
-    """Planes through a point's nearest neighbours in the map."""
+    """Planes and lines through a point's nearest neighbours in the map."""
 
     radius: Scalar
     """The farthest neighbour has to be nearer than this, m."""
     plane_tolerance: Scalar
     """All neighbours have to be within this distance of their plane, m."""
+    line_ratio: Scalar
+    """Neighbours make a line if their largest variance exceeds this many times the second."""
     distance_weight: Scalar
     """w of a match's score 1 - w |d| / sqrt(r): d its distance from the plane, r its range, m."""
     min_score: Scalar
@@ -149,6 +162,23 @@ class PointMapParams(eqx.Module):
     nearer_by: Scalar
     """A point takes its voxel over if it is nearer to the centre than the one there by more than this, m.
     Within the range noise that of the luckiest noise would stay: surfaces would lean to the centres."""
+
+
+class CubeGridParams(eqx.Module):
+    """The grid of cubes that LOAM keeps its map in; numbers are of cubes."""
+
+    edge: Scalar
+    """Of a cube, m."""
+    across: Scalar
+    """Cubes along x, and along y."""
+    up: Scalar
+    """Cubes along z."""
+    margin: Scalar
+    """The grid moves, by whole cubes, when fewer than this many are left before the sensor."""
+    matched_across: Scalar
+    """Along x, and along y: of so many around the sensor the points are matched."""
+    matched_up: Scalar
+    """Along z."""
 
 
 class MotionParams(eqx.Module):
@@ -198,9 +228,11 @@ class Params(eqx.Module):
     lidar: LidarParams
     map: MapParams
     registration: RegistrationParams
+    scan_to_scan: ScanToScanParams
     knn: KnnParams
     features: FeatureParams
     point_map: PointMapParams
+    cubes: CubeGridParams
     motion: MotionParams
     limits: LimitParams
     extrinsics: ExtrinsicsParams
@@ -225,7 +257,13 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "time_offset_sigma": 0.0,
     },
     "lidar": {"range_sigma": 0.045, "angle_sigma": 0.0, "min_range": 2.0, "max_range": 100.0},
-    "map": {"voxel_size": 1.2, "point_spacing": 0.25, "min_points": 3.0, "reach": 120.0},
+    "map": {
+        "voxel_size": 1.2,
+        "corner_voxel_size": 0.4,
+        "point_spacing": 0.25,
+        "min_points": 3.0,
+        "reach": 120.0,
+    },
     "registration": {
         "point_spacing": 0.5,
         "kernel": 0.15,
@@ -237,7 +275,14 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "inertial_degeneracy_ratio": 0.003,
         "min_matches": 50.0,
     },
-    "knn": {"radius": 5**0.5, "plane_tolerance": 0.1, "distance_weight": 0.9, "min_score": 0.9},
+    "scan_to_scan": {"radius": 5.0, "rings_apart": 2.5},
+    "knn": {
+        "radius": 5**0.5,
+        "plane_tolerance": 0.1,
+        "line_ratio": 3.0,
+        "distance_weight": 0.9,
+        "min_score": 0.9,
+    },
     "features": {
         "corner_threshold": 0.1,
         "flat_threshold": 0.1,
@@ -249,6 +294,14 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "surface_spacing": 0.2,
     },
     "point_map": {"cube_side_length": 1000.0, "cube_margin": 1.5, "nearer_by": 0.1},
+    "cubes": {
+        "edge": 50.0,
+        "across": 21.0,
+        "up": 11.0,
+        "margin": 3.0,
+        "matched_across": 5.0,
+        "matched_up": 3.0,
+    },
     "motion": {"initial_error": 2.0, "error_decay": 0.5},
     "limits": {"speed": 30.0, "gyro_bias": 1.0, "accel_bias": 1.0, "outage": 1.0},
     "extrinsics": {"rotation": [0.0, 0.0, 0.0, 1.0], "translation": [0.0, 0.0, 0.0], "time_offset": 0.0},
@@ -334,6 +387,8 @@ def invalid_value(path: str, value: Any) -> str:
         return "" if abs(norm - 1) < 1e-3 else f"must be a unit quaternion x y z w (its norm is {norm:.4g})"
     if path in _AT_MOST_ONE and value > 1:
         return "must be at most 1"
+    if path == "scan_to_scan.rings_apart" and value > 3:
+        return "must be at most 3"
     if path in _MAY_BE_ZERO:
         return "" if value >= 0 else "must not be negative"
     return "" if value > 0 else "must be greater than zero"

@@ -37,5 +37,24 @@ RECIPE_VALUES: dict[str, dict[str, Any]] = {
         "params.registration.translation_tolerance": 1e-3,
         "params.registration.inertial_degeneracy_ratio": 0.0,
     },
+    "loam": {
+        "config.imu.use": False,
+        # by the recording
+        "config.features.rings": 0,
+        "config.features.columns": 0,
+        "config.features.surface_points": 0,
+        "config.map.capacity": 65536,
+        "config.registration.max_iterations": 4,
+        "params.lidar.min_range": 0.3,
+        "params.map.voxel_size": 0.8,
+        "params.map.corner_voxel_size": 0.4,
+        "params.registration.kernel": 0.1,
+        "params.registration.reassociation_distance": 0.05,
+        "params.registration.rotation_tolerance": 1e-3,
+        "params.registration.translation_tolerance": 1e-3,
+        "params.registration.degeneracy_ratio": 1e-4,
+        "params.knn.radius": 1.0,
+        "params.knn.plane_tolerance": 0.2,
+    },
 }
 """By recipe; paths as in a settings file."""

@@ -167,7 +167,7 @@ def checked_together(settings: Settings, source: str) -> Settings:
             f"params.lidar.max_range ({lidar['max_range']})."
         )
     features = settings.config.features
-    if features.columns <= 2 * features.neighbours:
+    if 0 < features.columns <= 2 * features.neighbours:
         raise UsageError(
             f"{source}: config.features.columns ({features.columns}) must be more than twice "
             f"config.features.neighbours ({features.neighbours})."

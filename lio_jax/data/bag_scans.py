@@ -11,6 +11,7 @@ from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data import livox
 from lio_jax.data.bag_topics import Topic
+from lio_jax.data.beam_layout import check_beams
 from lio_jax.data.point_time import PointTiming, TimeSample, recognise_point_time, scan_period, stamp_end
 from lio_jax.data.pointcloud2 import decode_pointcloud2
 from lio_jax.data.raw_cloud import RawCloud
@@ -141,7 +142,7 @@ def recognise_scans(
             f"{where}: no point cloud can be read{reason}; the recording is empty or damaged there."
         )
     chosen_beams = max(set(beams), key=beams.count) if beams else config.beams or 16
-    ring_note = _ring_note(first, chosen_beams)
+    ring_note = _ring_note(first, chosen_beams, config.beams > 0, where)
     if config.compensated == "yes":
         time_note = "points are taken as motion compensated to the header stamp (config.data.compensated)"
         return ScanReading(None, "start", 0.0, chosen_beams, (time_note, *ring_note))
@@ -155,9 +156,11 @@ def recognise_scans(
     return ScanReading(None, stamp_at, period, chosen_beams, (time_note, *ring_note))
 
 
-def _ring_note(cloud: RawCloud, beams: int) -> tuple[str, ...]:
+def _ring_note(cloud: RawCloud, beams: int, given: bool, where: str) -> tuple[str, ...]:
     if cloud.ring is None:
-        return (f"ring: not recorded, reconstructed from elevation as of {beams} beams (config.data.beams)",)
+        reconstructed = f"ring: not recorded, reconstructed from elevation as of {beams} beams"
+        misfit = check_beams(cloud.points, beams, given, where)
+        return (f"{reconstructed} (config.data.beams)", *(f"ring: {sentence}" for sentence in misfit))
     if cloud.ring_source == "rows":
         return ("ring: not recorded, taken from the rows of the organised cloud",)
     return ()

@@ -11,7 +11,8 @@ KITTI_START_AZIMUTH = float(np.pi)
 """atan2(y, x) at which a sweep of KITTI's HDL-64E starts (straight behind), rad."""
 
 _TWO_PI = np.float32(2 * np.pi)
-_LOWEST_BEAM_DEG = {16: -15.0, 64: -24.33, 32: -92.0 / 3.0}
+BEAMS_DEG = {16: (-15.0, 15.0), 64: (-24.33, 2.0), 32: (-92.0 / 3.0, 32.0 / 3.0)}
+"""Elevation of the lowest and the highest beam of the sensors whose layout is known, by number of beams."""
 
 
 def azimuth_time(
@@ -69,7 +70,7 @@ def ring_from_elevation(points: NDArray[np.floating[Any]], beams: int) -> NDArra
     Raises:
         UsageError: no beam layout is known for that number of beams.
     """
-    elevation = _elevation_deg(points)
+    elevation = elevation_deg(points)
     if beams == 16:
         ring = ((elevation + 15.0) / 2.0 + 0.5).astype(np.int32)
         valid = ring < 16
@@ -115,11 +116,12 @@ def guess_beams(points: NDArray[np.floating[Any]]) -> int:
     """
     if len(points) == 0:
         return 16
-    lowest = float(np.percentile(_elevation_deg(points), 0.5))
-    return min(_LOWEST_BEAM_DEG, key=lambda beams: abs(_LOWEST_BEAM_DEG[beams] - lowest))
+    lowest = float(np.percentile(elevation_deg(points), 0.5))
+    return min(BEAMS_DEG, key=lambda beams: abs(BEAMS_DEG[beams][0] - lowest))
 
 
-def _elevation_deg(points: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+def elevation_deg(points: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    """Return the elevation of each point above the sensor's x-y plane, (n,) deg."""
     xyz = points.astype(np.float32, copy=False)
     elevation = np.arctan2(xyz[:, 2], np.sqrt(xyz[:, 0] ** 2 + xyz[:, 1] ** 2))
     return np.degrees(elevation)

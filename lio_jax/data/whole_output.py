@@ -10,7 +10,7 @@ from pathlib import Path
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.core.files import aside_of, folder_lock, remove_leftovers
 
-_KINDS = {"meta.yaml": "native recording", "metadata.yaml": "ROS 2 bag"}
+_KINDS = {"meta.yaml": "native recording", "metadata.yaml": "ROS 2 bag", "times.txt": "KITTI sequence"}
 
 
 def check_free(path: Path, overwrite: bool, marker: str = "") -> None:

@@ -9,7 +9,7 @@ Indices carry no gradient; the points they gather, and the means, do.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float32, Int32
+from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.config import Config
 from lio_jax.core.materialise import materialised
@@ -31,9 +31,9 @@ from lio_jax.lidar.smoothness import (
 class FeatureCloud(eqx.Module):
     """Points of one kind, padded to n."""
 
-    points: Float32[Array, "n 3"]
+    points: Float[Array, "n 3"]
     """m, lidar frame at each point's own firing time."""
-    time: Float32[Array, " n"]
+    time: Float[Array, " n"]
     """Firing time from the scan's start, s."""
     ring: Int32[Array, " n"]
     mask: Bool[Array, " n"]

@@ -56,11 +56,11 @@ def range_image(config: FeaturesConfig, params: Params, scan: Scan) -> RangeImag
     place = wanted & (scan.ring < config.rings)
     missed = jnp.sum(wanted & ~place, dtype=jnp.int32)
     if config.order == "azimuth":
-        return _by_azimuth(config, scan, place, missed)
+        return _byazimuth(config, scan, place, missed)
     return _by_arrival(config, scan, place, missed)
 
 
-def _by_azimuth(
+def _byazimuth(
     config: FeaturesConfig, scan: Scan, place: Bool[Array, " n"], missed: Int32[Array, ""]
 ) -> RangeImage:
     rings, columns, n = config.rings, config.columns, scan.ring.shape[0]
@@ -144,7 +144,7 @@ def azimuth_column(points: Float32[Array, "n 3"], columns: int) -> Int32[Array, 
         points: m, lidar frame.
         columns: of a full turn.
     """
-    turn = _azimuth(points[:, 0], points[:, 1]) * jnp.float32(columns / (2 * np.pi))
+    turn = azimuth(points[:, 0], points[:, 1]) * jnp.float32(columns / (2 * np.pi))
     column = jnp.floor(turn + jnp.float32(0.5)).astype(jnp.int32) + columns // 2
     return jnp.where(column >= columns, column - columns, column)
 
@@ -165,7 +165,7 @@ _ARCTAN = (
 Abramowitz & Stegun, Handbook of Mathematical Functions, 4.4.49."""
 
 
-def _azimuth(x: Float32[Array, " n"], y: Float32[Array, " n"]) -> Float32[Array, " n"]:
+def azimuth(x: Float32[Array, "*n"], y: Float32[Array, "*n"]) -> Float32[Array, "*n"]:
     """Return atan2(y, x) to float32: ``jnp.arctan2`` calls a scalar routine for each point on a CPU."""
     across, along = jnp.abs(y), jnp.abs(x)
     ratio = jnp.minimum(across, along) / jnp.maximum(jnp.maximum(across, along), jnp.float32(1e-30))

@@ -14,13 +14,19 @@ class MeanPoints(eqx.Module):
 
     points: Float[Array, "k 3"]
     """m."""
+    time: Float[Array, " k"] | None
+    """s; None where the points have none."""
     mask: Bool[Array, " k"]
     dropped: Int32[Array, ""]
     """Occupied voxels that found no room in the capacity."""
 
 
 def mean_per_voxel(
-    points: Float[Array, "n 3"], mask: Bool[Array, " n"], voxel_size: Float32[Array, ""], capacity: int
+    points: Float[Array, "n 3"],
+    mask: Bool[Array, " n"],
+    voxel_size: Float32[Array, ""],
+    capacity: int,
+    time: Float[Array, " n"] | None = None,
 ) -> MeanPoints:
     """Return the mean of each cubic voxel's points, of at most ``capacity`` voxels.
 
@@ -32,6 +38,7 @@ def mean_per_voxel(
         mask: which rows are real.
         voxel_size: edge length, m.
         capacity: number of returned rows.
+        time: of the points, to be averaged with them, s.
     """
     table_size = 1 << (4 * capacity - 1).bit_length()
     voxel = jnp.floor(jnp.where(mask[:, None], points, 0.0) / voxel_size).astype(jnp.int32)
@@ -43,8 +50,12 @@ def mean_per_voxel(
     x, y, z = (voxel[:, axis] == voxel[jnp.maximum(winner, 0), axis] for axis in range(3))
     row = materialised(jnp.where(mask & x & y & z & (row < capacity), row, capacity))
     count = jnp.zeros(capacity, points.dtype).at[row].add(1.0, mode="drop")
-    mean = jnp.zeros((capacity, 3), points.dtype)
+
+    def mean(values: Array) -> Array:
+        return jnp.zeros(capacity, values.dtype).at[row].add(values, mode="drop") / jnp.maximum(count, 1.0)
+
+    means = jnp.zeros((capacity, 3), points.dtype)
     for axis in range(3):
-        total = jnp.zeros(capacity, points.dtype).at[row].add(points[:, axis], mode="drop")
-        mean = mean.at[:, axis].set(total / jnp.maximum(count, 1.0))
-    return MeanPoints(mean, count > 0, jnp.maximum(rank[-1] + 1 - capacity, 0))
+        means = means.at[:, axis].set(mean(points[:, axis]))
+    times = None if time is None else mean(time)
+    return MeanPoints(means, times, count > 0, jnp.maximum(rank[-1] + 1 - capacity, 0))

@@ -41,12 +41,14 @@ def nearest_points(
     anchor: Int32[Array, "3"],
     voxel_size: Float32[Array, ""],
     neighbours: int,
+    radius: Float32[Array, ""] | float = jnp.inf,
 ) -> Neighbours:
     """Return the map points nearest each query.
 
     The eight blocks nearest a query are searched. Where a point outside of them might be nearer than the last
-    one found, all 27 blocks around it are: neighbours within a block's edge are always right, farther ones
-    are the nearest among those blocks. Distances that agree to a thousandth count as equal.
+    one found and than the radius, all 27 blocks around it are: neighbours within a block's edge are always
+    right, farther ones are the nearest among those blocks. Distances that agree to a thousandth count as
+    equal.
 
     Args:
         pmap: the map.
@@ -55,6 +57,7 @@ def nearest_points(
         anchor: block whose lower corner is the origin of ``points``.
         voxel_size: edge length of a voxel, m.
         neighbours: how many per query.
+        radius: farther neighbours need not be the nearest ones, m.
     """
     count = points.shape[0]
     edge = EDGE * voxel_size
@@ -69,7 +72,7 @@ def nearest_points(
     fraction = scaled - jnp.floor(scaled)
     # along each axis the eight blocks end with the query's own block on one side, one later on the other
     sure = edge * jnp.min(jnp.maximum(fraction, 1 - fraction), axis=-1)
-    unsure = mask & (found.squared_distance[-1] > sure**2)
+    unsure = mask & (jnp.minimum(found.squared_distance[-1], radius**2) > sure**2)
     rank = running_count(unsure) - 1
     waiting = jnp.full(count, count, jnp.int32).at[jnp.where(unsure, rank, count)].set(order, mode="drop")
     return search.over(found, waiting, rank[-1] + 1, jnp.array(_AROUND, jnp.int32), _WIDE_CHUNK)

@@ -64,19 +64,46 @@ def move_cube(
         margin: the sensor's least distance from a face, in blocks.
     """
     near = jnp.abs(anchor - pmap.cube) > half_side - margin
-    cube = jnp.where(near, anchor, pmap.cube)
+    return _cleared(pmap, jnp.where(near, anchor, pmap.cube), half_side)
+
+
+def shift_box(
+    pmap: PointMap,
+    anchor: Int32[Array, "3"],
+    half_sides: Float32[Array, "3"],
+    margin: Float32[Array, ""],
+    step: Float32[Array, ""],
+) -> PointMap:
+    """Shift a box, which takes the cube's place, by as many steps as keep its faces away from the sensor.
+
+    Args:
+        pmap: donate it.
+        anchor: the block that the sensor is in.
+        half_sides: half the box's edges along x, y and z, in blocks.
+        margin: the sensor's least distance from a face, in blocks.
+        step: in blocks; the box's centre is a multiple of it, rounded to a block.
+    """
+    number = jnp.round(pmap.cube / step)
+    away = anchor - number * step
+    steps = jnp.ceil(jnp.maximum(jnp.abs(away) - (half_sides - margin), 0.0) / step)
+    centre = jnp.round((number + jnp.sign(away) * steps) * step)
+    return _cleared(pmap, centre.astype(jnp.int32), half_sides)
+
+
+def _cleared(pmap: PointMap, centre: Int32[Array, "3"], half_sides: Float32[Array, "*d"]) -> PointMap:
+    """Return the map around another block, without what lies outside."""
 
     def cleared(_: Array, pmap: PointMap) -> PointMap:
-        gone = ~_inside(pmap.block, cube, half_side)[:, None]
+        gone = ~_inside(pmap.block, centre, half_sides)[:, None]
         return PointMap(
             jnp.where(gone, FREE, pmap.block),
             jnp.where(gone, jnp.inf, pmap.point),
             jnp.where(gone, jnp.inf, pmap.off_centre),
-            cube,
+            centre,
         )
 
     # a loop of no or one turn works in place, where a conditional would copy the map each time
-    return jax.lax.fori_loop(0, jnp.any(near).astype(jnp.int32), cleared, pmap)
+    return jax.lax.fori_loop(0, jnp.any(centre != pmap.cube).astype(jnp.int32), cleared, pmap)
 
 
 def insert(
@@ -85,7 +112,7 @@ def insert(
     mask: Bool[Array, " m"],
     anchor: Int32[Array, "3"],
     voxel_size: Float32[Array, ""],
-    half_side: Float32[Array, ""],
+    half_side: Float32[Array, "*d"],
     nearer_by: Float32[Array, ""],
 ) -> tuple[PointMap, Insertion]:
     """Keep, of each voxel, the point nearest its centre: the one held or one of ``points``.
@@ -96,7 +123,7 @@ def insert(
         mask: which rows are real.
         anchor: block whose lower corner is the origin of ``points``.
         voxel_size: edge length of a voxel, m.
-        half_side: half the cube's edge, in blocks: points outside are left out.
+        half_side: half the cube's edge, in blocks: points outside are left out. Of a box, three of them.
         nearer_by: a point held is replaced by one that is nearer by more than this, m.
     """
     capacity = pmap.block.shape[0]
@@ -126,9 +153,13 @@ def insert(
 
 
 def _inside(
-    block: Int32[Array, "m 3"], cube: Int32[Array, "3"], half_side: Float32[Array, ""]
+    block: Int32[Array, "m 3"], cube: Int32[Array, "3"], half_side: Float32[Array, "*d"]
 ) -> Bool[Array, " m"]:
-    """Return which blocks lie in the cube."""
+    """Return which blocks lie in the cube, or in the box."""
+    half_sides = jnp.broadcast_to(half_side, 3)
     # in floats, because a free slot's coordinates would overflow; they count as outside
-    x, y, z = (jnp.abs(block[:, i].astype(jnp.float32) - cube[i].astype(jnp.float32)) for i in range(3))
-    return jnp.maximum(jnp.maximum(x, y), z) <= half_side
+    x, y, z = (
+        jnp.abs(block[:, i].astype(jnp.float32) - cube[i].astype(jnp.float32)) <= half_sides[i]
+        for i in range(3)
+    )
+    return x & y & z

@@ -3,9 +3,9 @@
 from types import ModuleType
 
 from lio_jax.core.errors import UsageError
-from lio_jax.recipes import default, fast_lio2
+from lio_jax.recipes import default, fast_lio2, loam
 
-RECIPES: dict[str, ModuleType] = {"default": default, "fast_lio2": fast_lio2}
+RECIPES: dict[str, ModuleType] = {"default": default, "fast_lio2": fast_lio2, "loam": loam}
 """By name; each module has State, Output, init(config, params, imu), step(config, params, state, scan, imu),
 restart(config, params, state, imu) and moving_as(fresh, found), what a restart adds to init."""
 

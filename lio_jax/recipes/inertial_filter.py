@@ -30,8 +30,8 @@ from lio_jax.imu.initialise import initialise_at_rest
 from lio_jax.imu.path import Path
 from lio_jax.imu.strapdown import propagate_sweep
 from lio_jax.recipes.output import Evidence
+from lio_jax.registration.gauss_newton import NormalEquations, Registration
 from lio_jax.registration.point_evidence import PointEvidence
-from lio_jax.registration.scan_to_map import NormalEquations, Registration
 
 
 def levelled_start(params: Params, imu: ImuBatch) -> Uncertain:

@@ -16,7 +16,8 @@ from lio_jax.lidar.deskew import deskew_constant_velocity
 from lio_jax.lidar.thinning import thinned
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
 from lio_jax.recipes.output import Output
-from lio_jax.registration.scan_to_map import TOO_FEW_MATCHES, Frame, register
+from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES
+from lio_jax.registration.scan_to_map import Frame, register
 
 
 class State(eqx.Module):

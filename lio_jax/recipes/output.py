@@ -4,8 +4,8 @@ import equinox as eqx
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.estimation.innovation import Innovation
+from lio_jax.registration.gauss_newton import Registration
 from lio_jax.registration.point_evidence import PointEvidence
-from lio_jax.registration.scan_to_map import Registration
 
 
 class Evidence(eqx.Module):

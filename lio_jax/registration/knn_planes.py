@@ -3,14 +3,15 @@
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float, Float32
+from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.geometry import eigenvalues_and_normal3
 from lio_jax.core.materialise import materialised
-from lio_jax.core.params import Params
+from lio_jax.core.params import KnnParams, Params
 from lio_jax.mapping.nearest_points import nearest_points
 from lio_jax.mapping.point_map import PointMap
-from lio_jax.registration.scan_to_map import Frame, NormalEquations
+from lio_jax.registration.gauss_newton import NormalEquations
+from lio_jax.registration.scan_to_map import Frame
 
 _Coordinates = Float32[Array, "n k"]
 """One coordinate of n points in each of k columns."""
@@ -47,16 +48,53 @@ def associate(
     """
     _, placed = frame.place(jnp.where(mask[:, None], points, 0.0), T_world_lidar)
     placed = materialised(placed)
-    near = nearest_points(
-        pmap, placed, mask, frame.anchor, params.map.voxel_size.astype(jnp.float32), neighbours
-    )
-    radius, tolerance = (
-        value.astype(jnp.float32) for value in (params.knn.radius, params.knn.plane_tolerance)
-    )
+    return planes_near(pmap, placed, mask, frame.anchor, params.map.voxel_size, params.knn, neighbours)
+
+
+def planes_near(
+    pmap: PointMap,
+    placed: Float[Array, "k 3"],
+    mask: Bool[Array, " k"],
+    anchor: Int32[Array, "3"],
+    voxel_size: Float[Array, ""],
+    knn: KnnParams,
+    neighbours: int,
+) -> Planes:
+    """Return the planes of :func:`associate` for points in the frame anchored at ``anchor``, m."""
+    x, y, z, enough = neighbours_within(pmap, placed, mask, anchor, voxel_size, knn.radius, neighbours)
+    planes, farthest = fit_planes(x, y, z)
+    valid = enough & (farthest <= knn.plane_tolerance.astype(jnp.float32))
+    return Planes(planes.normal, planes.offset, valid)
+
+
+def neighbours_within(
+    pmap: PointMap,
+    placed: Float[Array, "k 3"],
+    mask: Bool[Array, " k"],
+    anchor: Int32[Array, "3"],
+    voxel_size: Float[Array, ""],
+    radius: Float[Array, ""],
+    neighbours: int,
+) -> tuple[_Coordinates, _Coordinates, _Coordinates, Bool[Array, " k"]]:
+    """Return x, y and z of each point's nearest map points, and which have all of them within a radius.
+
+    Args:
+        pmap: the map.
+        placed: m, in the frame anchored at ``anchor``.
+        mask: which points are real.
+        anchor: block whose lower corner is the origin of ``placed``.
+        voxel_size: of the map, m.
+        radius: m.
+        neighbours: how many per point.
+
+    Returns:
+        Columns in the same frame, zero where there are too few.
+    """
+    size, radius = voxel_size.astype(jnp.float32), radius.astype(jnp.float32)
+    near = nearest_points(pmap, placed, mask, anchor, size, neighbours, radius)
     enough = mask & (near.squared_distance[-1] < radius**2)
     x, y, z = (jnp.where(enough, column, 0.0) for column in (near.x, near.y, near.z))
-    planes, farthest = fit_planes(x, y, z)
-    return Planes(planes.normal, planes.offset, enough & (farthest <= tolerance))
+    return x, y, z, enough
 
 
 def fit_planes(x: _Coordinates, y: _Coordinates, z: _Coordinates) -> tuple[Planes, Float32[Array, " k"]]:
@@ -71,15 +109,30 @@ def fit_planes(x: _Coordinates, y: _Coordinates, z: _Coordinates) -> tuple[Plane
     Returns:
         The planes, all called valid, and the largest distance of each plane's own points from it, m.
     """
+    (cx, cy, cz), (qx, qy, qz), moments = spread(x, y, z)
+    _, normal = materialised(eigenvalues_and_normal3(moments[:, :3], moments[:, 3:]))
+    nx, ny, nz = normal[:, 0], normal[:, 1], normal[:, 2]
+    farthest = jnp.max(jnp.abs(nx * qx + ny * qy + nz * qz), 0)
+    return Planes(normal, -(nx * cx + ny * cy + nz * cz), jnp.ones(x.shape[1], bool)), farthest
+
+
+def spread(
+    x: _Coordinates, y: _Coordinates, z: _Coordinates
+) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array], Float32[Array, "k 6"]]:
+    """Return each column's centre, its points from there, and their second moments.
+
+    Args:
+        x: m; y and z likewise.
+
+    Returns:
+        The moments divided by the number of points, xx, yy, zz, xy, xz and yz, m^2.
+    """
     n = x.shape[0]
     cx, cy, cz = materialised((jnp.sum(x, 0) / n, jnp.sum(y, 0) / n, jnp.sum(z, 0) / n))
     qx, qy, qz = x - cx, y - cy, z - cz
     pairs = ((qx, qx), (qy, qy), (qz, qz), (qx, qy), (qx, qz), (qy, qz))
     moments = materialised(jnp.stack([jnp.sum(u * v, 0) / n for u, v in pairs], -1))
-    _, normal = materialised(eigenvalues_and_normal3(moments[:, :3], moments[:, 3:]))
-    nx, ny, nz = normal[:, 0], normal[:, 1], normal[:, 2]
-    farthest = jnp.max(jnp.abs(nx * qx + ny * qy + nz * qz), 0)
-    return Planes(normal, -(nx * cx + ny * cy + nz * cz), jnp.ones(x.shape[1], bool)), farthest
+    return (cx, cy, cz), (qx, qy, qz), moments
 
 
 def linearise(

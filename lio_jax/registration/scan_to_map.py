@@ -14,52 +14,16 @@ from lio_jax.core.params import Params
 from lio_jax.core.rotation import rotation_matrix
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, query_nearest
 from lio_jax.registration.association import Association, associated, no_association
-
-CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES = 0, 1, 2
-"""Status codes of a solve."""
-
-
-class Registration(eqx.Module):
-    """Result of a scan-to-map solve."""
-
-    T_world_lidar: jaxlie.SE3
-    information: Float[Array, "6 6"]
-    """Inverse covariance of the right perturbation, rotation (rad) before translation (m)."""
-    degenerate: Bool[Array, " 6"]
-    """Which eigenvectors of the scaled information were held at the prediction, weakest first."""
-    matches: Int32[Array, ""]
-    """Points that found a distribution in the map."""
-    rmse: Float[Array, ""]
-    """Robustly weighted root mean square distance to the map, m."""
-    iterations: Int32[Array, ""]
-    status: Int32[Array, ""]
-    """CONVERGED, ITERATION_LIMIT or TOO_FEW_MATCHES; in the last case the pose is the prediction."""
-
-
-class NormalEquations(eqx.Module):
-    """The solve linearised at one pose, in world axes at the sensor's position."""
-
-    hessian: Float[Array, "6 6"]
-    gradient: Float[Array, "6"]
-    matches: Int32[Array, ""]
-    weight: Float[Array, ""]
-    """Sum of the robust weights."""
-    squared_error: Float[Array, ""]
-    """Robustly weighted sum of squared distances, m^2."""
-    arm_squared: Float[Array, ""]
-    """Mean squared distance of the points from the sensor, m^2: scales rotations to metres."""
-
-    @staticmethod
-    def nothing(dtype: jnp.dtype) -> "NormalEquations":
-        """Return the equations of no points."""
-        zero = jnp.zeros((), dtype)
-        return NormalEquations(jnp.zeros((6, 6), dtype), jnp.zeros(6, dtype), jnp.int32(0), zero, zero, zero)
-
-    def rmse(self) -> Float[Array, ""]:
-        """Return the robustly weighted root mean square distance to the map, m; 0 without matches."""
-        some = (self.weight > 0) & (self.squared_error > 0)
-        mean = jnp.where(some, self.squared_error, 1.0) / jnp.where(some, self.weight, 1.0)
-        return jnp.where(some, jnp.sqrt(mean), 0.0)
+from lio_jax.registration.gauss_newton import (
+    Directions,
+    NormalEquations,
+    Registration,
+    is_small,
+    moved,
+    observable_step,
+    registration_at,
+    unmet,
+)
 
 
 class Frame(eqx.Module):
@@ -252,21 +216,9 @@ def register(
         partial(_solve, max_iterations), _again, _missed, lambda step, equations, end, task: equations
     )
     step, end, equations = implicit(problem, task)
-    T = _moved(end.T_world_lidar, step)
-    settings = params.registration
-    lost = (equations.matches < settings.min_matches) | ~jnp.all(jnp.isfinite(T.wxyz_xyz))
-    T = jaxlie.SE3(jnp.where(lost, T_world_lidar.wxyz_xyz, T.wxyz_xyz))
-    to_body = jax.scipy.linalg.block_diag(*[rotation_matrix(T.rotation())] * 2)
-    return Registration(
-        T_world_lidar=T,
-        information=jnp.where(lost, 0.0, to_body.T @ equations.hessian @ to_body),
-        degenerate=end.degenerate,
-        matches=equations.matches,
-        rmse=equations.rmse(),
-        iterations=end.iterations,
-        status=jnp.where(lost, TOO_FEW_MATCHES, jnp.where(end.done, CONVERGED, ITERATION_LIMIT)).astype(
-            jnp.int32
-        ),
+    T = moved(end.T_world_lidar, step)
+    return registration_at(
+        T, T_world_lidar, equations, end.directions, end.iterations, end.done, params.registration
     )
 
 
@@ -303,10 +255,8 @@ class _End(eqx.Module):
     iterations: Int32[Array, ""]
     done: Bool[Array, ""]
     association: Association[Matches]
-    vectors: Float[Array, "6 6"]
-    """Directions in columns, scaled to metres, in which the last step was taken ..."""
-    degenerate: Bool[Array, " 6"]
-    """... and which of them were held."""
+    directions: Directions
+    """Of the last step."""
 
 
 def _solve(max_iterations: int, task: _Task) -> Solution:
@@ -326,62 +276,29 @@ def _solve(max_iterations: int, task: _Task) -> Solution:
             settings.reassociation_distance,
         )
         equations = task.linearised(T, points, association.found, end.iterations)
-        step, vectors, degenerate = _solve_observable(equations, settings.degeneracy_ratio)
-        small = (jnp.linalg.norm(step[:3]) < settings.rotation_tolerance) & (
-            jnp.linalg.norm(step[3:]) < settings.translation_tolerance
-        )
-        done = small & (task.opening(end.iterations) < settings.kernel)
+        step, directions = observable_step(equations, settings.degeneracy_ratio)
+        done = is_small(step, settings) & (task.opening(end.iterations) < settings.kernel)
         done = done | (equations.matches < settings.min_matches)
-        following = _moved(T, step)
-        return _End(following, end.iterations + 1, done, association, vectors, degenerate), equations
+        following = moved(T, step)
+        return _End(following, end.iterations + 1, done, association, directions), equations
 
     def unfinished(carry: tuple) -> Array:
         return (carry[0].iterations < max_iterations) & ~carry[0].done
 
     dtype = prediction.wxyz_xyz.dtype
     nothing = no_association(no_matches(mask), prediction)
-    start = _End(
-        prediction, jnp.int32(0), jnp.array(False), nothing, jnp.zeros((6, 6), dtype), jnp.zeros(6, bool)
-    )
+    start = _End(prediction, jnp.int32(0), jnp.array(False), nothing, Directions.none(dtype))
     end, equations = jax.lax.while_loop(unfinished, iterate, (start, NormalEquations.nothing(dtype)))
     return Solution(jnp.zeros(6, dtype), end, equations)
 
 
 def _again(step: Float[Array, "6"], end: _End, task: _Task) -> NormalEquations:
     """Linearise once more at a pose beside the solution, with the associations found."""
-    T = _moved(end.T_world_lidar, step)
+    T = moved(end.T_world_lidar, step)
     return task.linearised(T, task.points_at(T), end.association.found, end.iterations - 1)
 
 
 def _missed(step: Float[Array, "6"], equations: NormalEquations, end: _End, task: _Task) -> Float[Array, "6"]:
     """Return what vanishes at the solution: the gradient where observed, else the way from the prediction."""
-    T = _moved(end.T_world_lidar, step)
-    turn = (T.rotation() @ task.T_predicted.rotation().inverse()).log()
-    way = jnp.concatenate([turn, T.translation() - task.T_predicted.translation()])
-    along = jnp.linalg.solve(end.vectors, way)
-    held = along - jax.lax.stop_gradient(along)
-    return jnp.where(end.degenerate, held, end.vectors.T @ equations.gradient)
-
-
-def _moved(T_world_lidar: jaxlie.SE3, step: Float[Array, "6"]) -> jaxlie.SE3:
-    """Return a pose turned and moved in world axes at its own position."""
-    rotation = (jaxlie.SO3.exp(step[:3]) @ T_world_lidar.rotation()).normalize()
-    return jaxlie.SE3.from_rotation_and_translation(rotation, T_world_lidar.translation() + step[3:])
-
-
-def _solve_observable(
-    equations: NormalEquations, degeneracy_ratio: Float[Array, ""]
-) -> tuple[Float[Array, "6"], Float[Array, "6 6"], Bool[Array, " 6"]]:
-    """Return the Gauss-Newton step in the directions that are observed, the directions, and which are not.
-
-    Rotations are scaled by the scan's rms lever arm so that all six directions are in metres.
-    """
-    dtype = equations.hessian.dtype
-    scale = jnp.concatenate([jnp.full(3, 1.0) / jnp.sqrt(equations.arm_squared + 1e-6), jnp.ones(3)]).astype(
-        dtype
-    )
-    values, vectors = jnp.linalg.eigh(scale[:, None] * equations.hessian * scale)
-    degenerate = values <= jnp.maximum(degeneracy_ratio * values[-1], jnp.finfo(dtype).tiny)
-    along = -(vectors.T @ (scale * equations.gradient))
-    along = jnp.where(degenerate, 0.0, along / jnp.where(degenerate, 1.0, values))
-    return scale * (vectors @ along), scale[:, None] * vectors, degenerate
+    T = moved(end.T_world_lidar, step)
+    return unmet(T, task.T_predicted, end.directions, equations.gradient)

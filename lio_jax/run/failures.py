@@ -10,7 +10,7 @@ from lio_jax.core.settings import Settings
 from lio_jax.core.types import ImuBatch
 from lio_jax.estimation.iterated_filter import NOT_FINITE
 from lio_jax.imu.sampling import LONGEST_GAP
-from lio_jax.registration.scan_to_map import CONVERGED, ITERATION_LIMIT
+from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT
 from lio_jax.run.directions import unobserved_directions
 
 _UNLIKELY_NIS = 22.46

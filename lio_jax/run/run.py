@@ -27,6 +27,7 @@ from lio_jax.run.imu_rate import write_imu_rate
 from lio_jax.run.keyframes import keyframe_indices, odometry_edges
 from lio_jax.run.map_file import MapFile
 from lio_jax.run.overflow import Overflow
+from lio_jax.run.sensor_sizes import with_sensor_sizes
 from lio_jax.run.surroundings import fitted_to_surroundings
 from lio_jax.run.track import CompiledStep, Tracked, track
 from lio_jax.run.trajectory_log import TrajectoryLog
@@ -58,10 +59,11 @@ class RunResult:
 
 
 def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list[str]]:
-    """Take from the recording what was not given: T_imu_lidar, the voxels' size; say what came from where."""
+    """Take from the recording what was not given, and say so: T_imu_lidar, sizes of voxels and of features."""
     settings, calibration = _calibrated(sequence, settings)
     settings, fitted = fitted_to_surroundings(sequence, settings)
-    return settings, [calibration, *fitted]
+    settings, sizes = with_sensor_sizes(settings, sequence.scans())
+    return settings, [calibration, *fitted, *sizes]
 
 
 def _calibrated(sequence: Sequence, settings: Settings) -> tuple[Settings, str]:

@@ -61,3 +61,17 @@ def test_voxels_beyond_the_capacity_are_counted_and_left_out_all_over_the_scan()
 def test_nothing_gives_nothing():
     found, dropped = means(np.full((3000, 3), np.nan, np.float32), np.zeros(3000, bool), 256)
     assert len(found) == dropped == 0
+
+
+def test_times_are_averaged_with_the_points():
+    rng = np.random.default_rng(7)
+    points = rng.uniform(-2, 2, (800, 3)).astype(np.float32)
+    time = (points @ [0.01, 0.02, -0.03] + 0.05).astype(np.float32)
+    mask = rng.random(800) > 0.3
+    arrays = jnp.asarray(points), jnp.asarray(mask)
+    found = _mean(*arrays, jnp.float32(VOXEL), 1024, jnp.asarray(time))
+    kept = np.asarray(found.mask)
+    # linear in the coordinates, so that it is so for the means
+    expected_time = np.asarray(found.points)[kept] @ [0.01, 0.02, -0.03] + 0.05
+    np.testing.assert_allclose(np.asarray(found.time)[kept], expected_time, atol=1e-6)
+    assert _mean(*arrays, jnp.float32(VOXEL), 1024).time is None

@@ -38,10 +38,10 @@ def put(pmap: PointMap, points, anchor=(0, 0, 0), mask=None, half_side=WIDE, nea
     return pmap, added[:count], int(report.dropped)
 
 
-def held(pmap: PointMap) -> np.ndarray:
+def held(pmap: PointMap, voxel_size: float = VOXEL) -> np.ndarray:
     """Return all points of the map in world, (n, 3) m."""
     point = np.asarray(pmap.point, float).reshape(-1, 3, EDGE**3)
-    centre = (np.asarray(pmap.block, float) + 0.5) * BLOCK
+    centre = (np.asarray(pmap.block, float) + 0.5) * EDGE * voxel_size
     full = np.isfinite(point[:, 0])
     return (point + centre[:, :, None]).transpose(0, 2, 1)[full]
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.core.types import Scan
 from lio_jax.recipes import default, recipe_named
-from lio_jax.registration.scan_to_map import CONVERGED, TOO_FEW_MATCHES
+from lio_jax.registration.gauss_newton import CONVERGED, TOO_FEW_MATCHES
 from tests.recipes.drive import (
     CONFIG,
     PARAMS,

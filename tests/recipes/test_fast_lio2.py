@@ -15,7 +15,7 @@ from lio_jax.core.error_state import EXTRINSIC_ROTATION, GYRO_BIAS, POSITION
 from lio_jax.core.params import DEFAULTS, Params
 from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.recipes import fast_lio2, recipe_named
-from lio_jax.registration.scan_to_map import TOO_FEW_MATCHES
+from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES
 from lio_jax.run.feed import padded
 from lio_jax.run.imu_feed import ImuFeed
 from lio_jax.sim.imu import ImuModel

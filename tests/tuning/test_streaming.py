@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.params import DIFFERENTIABLE
+from lio_jax.core.settings import recipe_settings
 from lio_jax.recipes import RECIPES
 from lio_jax.run.track import CompiledStep, stepped
 from lio_jax.tuning.objective import Observed
@@ -81,7 +82,12 @@ def total(held, recording):
 NOT_SMOOTH = {("fast_lio2", False)}
 """Averaging and gating after motion compensation by the estimated velocity jump with any step, however small:
 central differences see the jumps."""
-CASES = [(recipe, inertial) for recipe in RECIPES for inertial in (True, False)]
+CASES = [
+    (recipe, inertial)
+    for recipe in RECIPES
+    for inertial in (True, False)
+    if recipe_settings(recipe).config.imu.use or not inertial
+]
 
 
 @pytest.mark.parametrize(("recipe", "inertial"), [case for case in CASES if case not in NOT_SMOOTH])

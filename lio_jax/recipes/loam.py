@@ -1,0 +1,301 @@
+"""LOAM: odometry from scan to scan, mapping from scan to map, no inertial data (A-LOAM).
+
+scan -> features -> scan to scan -> deskew -> scan to map -> insert -> cubes
+                         |   every n-th scan --/    |
+                     T_odom_lidar  ------------> T_map_odom -> T_world_lidar at every scan
+
+Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014. Its values are those of
+``recipe_settings("loam")``. Inertial samples are not used.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int32
+
+from lio_jax.core.config import Config
+from lio_jax.core.errors import UsageError
+from lio_jax.core.params import Params
+from lio_jax.core.types import ImuBatch, NavState, Scan, initial_nav_state
+from lio_jax.lidar.deskew import deskew_constant_velocity
+from lio_jax.lidar.features import FeatureCloud, LoamFeatures, loam_features
+from lio_jax.lidar.voxel_mean import mean_per_voxel
+from lio_jax.recipes.output import Output
+from lio_jax.registration.cube_map import (
+    CubeMap,
+    ScanToMap,
+    added_to,
+    empty_cube_map,
+    frames_at,
+)
+from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES, Registration
+from lio_jax.registration.lines_and_planes import FeaturePoints, Frames
+from lio_jax.registration.rounds import match_in_rounds
+from lio_jax.registration.scan_to_scan import LastScan, ScanToScan, empty_scan, last_scan
+
+
+class Targets(eqx.Module):
+    """What scans are matched with: constants of the derivative."""
+
+    cubes: CubeMap
+    last: LastScan
+    """In the lidar frame of the last scan's middle."""
+
+
+class State(eqx.Module):
+    """What is carried from scan to scan."""
+
+    nav: NavState
+    """At the last scan's end, corrected by the map."""
+    T_odom_lidar: jaxlie.SE3
+    """Of the scan to match the next one with, at its middle: the instant at which deskewing errs least."""
+    T_map_odom: jaxlie.SE3
+    """Correction that the last match with the map found."""
+    since: Float[Array, ""]
+    """From that middle to the last scan's end, s."""
+    twist: Float[Array, "6"]
+    """Velocity of the lidar in its own frame, m/s then rad/s."""
+    scans: Int32[Array, ""]
+    """Scans with points seen so far."""
+    map: Targets
+
+
+def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
+    """Return the state before the first scan: at the world's origin, with an empty map.
+
+    Args:
+        config: static.
+        params: traced.
+        imu: not used.
+    """
+    features = config.features
+    if not (features.rings and features.columns and features.surface_points):
+        raise UsageError(
+            "config.features.rings, columns and surface_points are 0, for by the recording; "
+            "take the settings from settings_for(sequence, settings), or set them."
+        )
+    nav = initial_nav_state(params.extrinsics.T_imu_lidar())
+    dtype = nav.velocity.dtype
+    start = nav.T_world_imu @ nav.T_imu_lidar
+    corners = features.corners * features.sectors * features.rings
+    return State(
+        nav=nav,
+        T_odom_lidar=jaxlie.SE3(jnp.array([1, 0, 0, 0, 0, 0, 0], dtype)),
+        T_map_odom=jaxlie.SE3(start.wxyz_xyz),
+        since=jnp.zeros((), dtype),
+        twist=jnp.zeros(6, dtype),
+        scans=jnp.int32(0),
+        map=Targets(
+            empty_cube_map(config.map.capacity),
+            empty_scan(corners, features.surface_points, features.rings),
+        ),
+    )
+
+
+def restart(config: Config, params: Params, state: State, imu: ImuBatch | None = None) -> State:
+    """Return the state before the first scan once more, now with the velocity that ``state`` found.
+
+    A vehicle that is already moving distorts its first scan, which nothing can compensate until the second.
+    """
+    return moving_as(init(config, params, imu), state)
+
+
+def moving_as(fresh: State, found: State) -> State:
+    """Return the state before the first scan with the velocity of another: a mere exchange of leaves."""
+    return eqx.tree_at(lambda state: state.twist, fresh, found.twist)
+
+
+def step(
+    config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch | None = None
+) -> tuple[State, Output]:
+    """Match one scan with the last one, then with the map, and add it to the map.
+
+    Args:
+        config: static.
+        params: traced.
+        state: donate it.
+        scan: padded sweep; ``scan.interval`` is the time since the last scan's end.
+        imu: not used.
+    """
+    first = state.scans == 0
+    with jax.named_scope("features"):
+        features = _features(config, params, scan)
+        enough = jnp.sum(features.sharp.mask) + jnp.sum(features.flat.mask) > params.registration.min_matches
+    with jax.named_scope("predict"):
+        middle = 0.5 * scan.duration.astype(state.twist.dtype)
+        # the first scan's end is the world's origin, however many empty scans went before
+        interval = jnp.where(first, 0.0, scan.interval.astype(state.twist.dtype))
+        elapsed = state.since + interval - middle
+        motion = _Motion(state.twist, elapsed, ~first & (elapsed > 0), middle)
+    with jax.named_scope("scan_to_scan"):
+        picks = _Compensated(features.sharp, features.flat, motion, config.loam.compensate)
+        prediction = jaxlie.SE3.exp(elapsed * state.twist)
+        odometry = match_in_rounds(
+            ScanToScan(last=state.map.last, compensated=picks, T_predicted=prediction, params=params),
+            jnp.where(state.scans == 1, jnp.int32(config.loam.opening_rounds), jnp.int32(config.loam.rounds)),
+            config.registration.max_iterations,
+        )
+        T_odom_lidar = state.T_odom_lidar @ odometry.T_world_lidar
+        twist = motion.twist_to(odometry.T_world_lidar)
+    with jax.named_scope("scan_to_map"):
+        corner, surface, thinned_away = _thinned(config, params, features)
+        thin = _Compensated(corner, surface, motion, config.loam.compensate)(odometry.T_world_lidar)
+        guess = state.T_map_odom @ T_odom_lidar
+        its_turn = state.scans % config.loam.mapping_every == 0
+        mapping = _mapped(config, params, state.map.cubes, thin, guess, odometry, its_turn)
+        lost = (mapping.status == TOO_FEW_MATCHES) & ~first
+        T = mapping.T_world_lidar
+    with jax.named_scope("insert"):
+        # the map is a constant of the derivative
+        last = _last(config, features, motion, jax.lax.stop_gradient(odometry.T_world_lidar))
+        frames, placed = jax.lax.stop_gradient(_placed(params, thin, T))
+        cubes, *added = added_to(state.map.cubes, placed, its_turn & ~lost, frames, params)
+
+    T_world_imu = T @ jaxlie.SE3.exp(middle * twist) @ params.extrinsics.T_imu_lidar().inverse()
+    velocity = T_world_imu.rotation() @ (params.extrinsics.T_imu_lidar().adjoint() @ twist)[:3]
+    nav = dataclasses.replace(state.nav, T_world_imu=jaxlie.SE3(T_world_imu.wxyz_xyz), velocity=velocity)
+    # a scan too poor to be matched with leaves the last one in its place
+    of_odometry = T_odom_lidar, middle, last
+    of_odometry = jax.tree.map(
+        lambda new, old: jnp.where(enough, new, old),
+        of_odometry,
+        (state.T_odom_lidar, state.since + interval, state.map.last),
+    )
+    new_state = State(
+        nav=nav,
+        T_odom_lidar=of_odometry[0],
+        T_map_odom=jaxlie.SE3((T @ T_odom_lidar.inverse()).wxyz_xyz),
+        since=of_odometry[1],
+        twist=twist,
+        scans=state.scans + jnp.any(features.less_flat.mask).astype(jnp.int32),
+        map=Targets(cubes, of_odometry[2]),
+    )
+    corner_offset = (frames.corner.origin - frames.surface.origin).astype(placed.corner.dtype)
+    return new_state, Output(
+        registration=mapping,
+        lost=lost,
+        nis=jnp.zeros_like(middle),
+        nis_dof=jnp.int32(0),
+        points=jnp.concatenate([placed.corner + corner_offset, placed.surface]),
+        points_mask=jnp.concatenate([placed.corner_mask, placed.surface_mask]),
+        added=jnp.concatenate([insertion.added for insertion in added]),
+        origin=frames.surface.origin,
+        thinned_away=thinned_away + features.dropped,
+        map_dropped=added[0].dropped + added[1].dropped,
+    )
+
+
+class _Motion(eqx.Module):
+    """The motion since the scan to match with, as long as its end is under trial."""
+
+    last_twist: Float[Array, "6"]
+    elapsed: Float[Array, ""]
+    known: Bool[Array, ""]
+    middle: Float[Array, ""]
+    """Of the scan, s from its start."""
+
+    def twist_to(self, T_last_lidar: jaxlie.SE3) -> Float[Array, "6"]:
+        """Return the constant twist that leads to a pose; the last one where there was no scan before."""
+        return jnp.where(
+            self.known, T_last_lidar.log() / jnp.where(self.known, self.elapsed, 1.0), self.last_twist
+        )
+
+    def at_middle(self, cloud: FeatureCloud, T_last_lidar: jaxlie.SE3) -> Float[Array, "n 3"]:
+        """Return a cloud as the sensor would have seen it from where it was in the scan's middle."""
+        delay = cloud.time - self.middle.astype(cloud.time.dtype)
+        return deskew_constant_velocity(cloud.points, delay, self.twist_to(T_last_lidar))
+
+
+class _Compensated(eqx.Module):
+    """Corners and surface points, compensated by the motion that a trial pose implies."""
+
+    corner: FeatureCloud
+    surface: FeatureCloud
+    motion: _Motion
+    wanted: bool = eqx.field(static=True)
+
+    def __call__(self, T_last_lidar: jaxlie.SE3) -> FeaturePoints:
+        """Return the points in the lidar frame of the scan's middle."""
+        corner, surface = (
+            self.motion.at_middle(cloud, T_last_lidar) if self.wanted else cloud.points
+            for cloud in (self.corner, self.surface)
+        )
+        return FeaturePoints(corner, self.corner.mask, surface, self.surface.mask)
+
+
+def _features(config: Config, params: Params, scan: Scan) -> LoamFeatures:
+    """Pick in single precision: which points they are has no derivative."""
+    dtype = scan.points.dtype
+    single = dataclasses.replace(
+        scan, points=scan.points.astype(jnp.float32), time=scan.time.astype(jnp.float32)
+    )
+    found = loam_features(config, params, single)
+    return jax.tree.map(lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, found)
+
+
+def _thinned(
+    config: Config, params: Params, features: LoamFeatures
+) -> tuple[FeatureCloud, FeatureCloud, Int32[Array, ""]]:
+    """Return corners and surface points to match with the map, and how many found no room.
+
+    They are averaged before the compensation and not after it, so that the groups do not depend on the
+    motion: points as near to each other as these are moved alike.
+    """
+    kinds = (
+        (features.less_sharp, params.map.corner_voxel_size, config.loam.corner_points),
+        (features.less_flat, params.map.voxel_size, config.loam.surface_points),
+    )
+    clouds, dropped = [], jnp.int32(0)
+    for cloud, size, capacity in kinds:
+        mean = mean_per_voxel(cloud.points, cloud.mask, size.astype(jnp.float32), capacity, cloud.time)
+        assert mean.time is not None
+        clouds.append(FeatureCloud(mean.points, mean.time, jnp.zeros(capacity, jnp.int32), mean.mask))
+        dropped += mean.dropped
+    return clouds[0], clouds[1], dropped
+
+
+def _mapped(
+    config: Config,
+    params: Params,
+    cubes: CubeMap,
+    points: FeaturePoints,
+    guess: jaxlie.SE3,
+    odometry: Registration,
+    its_turn: Bool[Array, ""],
+) -> Registration:
+    """Return the match with the map, or that with the last scan if it is not the map's turn."""
+
+    def with_map() -> Registration:
+        task = ScanToMap(
+            map=cubes, points=points, T_predicted=guess, params=params, neighbours=config.knn.neighbours
+        )
+        found = match_in_rounds(task, config.loam.rounds, config.registration.max_iterations)
+        # the points' compensation rests on the odometry
+        unfinished = (found.status == CONVERGED) & (odometry.status == ITERATION_LIMIT)
+        return dataclasses.replace(found, status=jnp.where(unfinished, ITERATION_LIMIT, found.status))
+
+    if config.loam.mapping_every == 1:
+        return with_map()
+    return jax.lax.cond(
+        its_turn, with_map, lambda: dataclasses.replace(odometry, T_world_lidar=jaxlie.SE3(guess.wxyz_xyz))
+    )
+
+
+def _last(config: Config, features: LoamFeatures, motion: _Motion, T_last_lidar: jaxlie.SE3) -> LastScan:
+    """Return what the next scan is matched with."""
+    clouds = features.less_sharp, features.less_flat
+    corner, surface = (
+        motion.at_middle(cloud, T_last_lidar) if config.loam.compensate else cloud.points for cloud in clouds
+    )
+    return last_scan(*clouds, corner.astype(jnp.float32), surface.astype(jnp.float32), config.features.rings)
+
+
+def _placed(params: Params, points: FeaturePoints, T: jaxlie.SE3) -> tuple[Frames, FeaturePoints]:
+    """Return the points in the frames of the maps near a pose."""
+    frames = frames_at(T.translation(), params)
+    _, corner = frames.corner.place(points.corner, T)
+    _, surface = frames.surface.place(points.surface, T)
+    return frames, FeaturePoints(corner, points.corner_mask, surface, points.surface_mask)

@@ -1,0 +1,145 @@
+"""A scan against the one before it: corners on lines, flat points on planes through adjacent rings (A-LOAM).
+
+Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014, section V.B.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float32
+
+from lio_jax.core.materialise import materialised
+from lio_jax.core.params import Params
+from lio_jax.lidar.features import FeatureCloud
+from lio_jax.registration.knn_planes import Planes
+from lio_jax.registration.lines_and_planes import (
+    FeaturePoints,
+    Frames,
+    Lines,
+    LinesAndPlanes,
+    line_through,
+)
+from lio_jax.registration.ring_index import Nearest, Queries, RingIndex, nearest_by_ring, ring_index
+from lio_jax.registration.rounds import Task
+from lio_jax.registration.scan_to_map import Frame
+
+_Vectors = tuple[Array, Array, Array]
+
+
+class LastScan(eqx.Module):
+    """What the next scan is matched with, in the lidar frame of one instant."""
+
+    index: RingIndex
+    """Less sharp points, then less flat ones, which count as rings of their own."""
+
+
+def last_scan(
+    corner: FeatureCloud,
+    surface: FeatureCloud,
+    corner_points: Float32[Array, "c 3"],
+    surface_points: Float32[Array, "s 3"],
+    rings: int,
+) -> LastScan:
+    """Prepare a scan's less sharp and less flat points for the next scan.
+
+    Args:
+        corner: less sharp points, for their rings and mask.
+        surface: less flat points, likewise.
+        corner_points: of ``corner``, in the frame of the instant, m.
+        surface_points: of ``surface``, likewise.
+        rings: number of the sensor's rings.
+    """
+    points = jnp.concatenate([corner_points, surface_points])
+    ring = jnp.concatenate([corner.ring, surface.ring + rings])
+    return LastScan(ring_index(points, ring, jnp.concatenate([corner.mask, surface.mask]), 2 * rings))
+
+
+def empty_scan(corners: int, surfaces: int, rings: int) -> LastScan:
+    """Return a scan without points, of the given capacities."""
+    none = jnp.zeros(corners + surfaces, jnp.int32)
+    return LastScan(ring_index(jnp.zeros((len(none), 3), jnp.float32), none, none > 0, 2 * rings))
+
+
+class ScanToScan(Task):
+    """A scan's sharp and flat points, and the last scan. The pose sought is that in the last scan's frame."""
+
+    last: LastScan
+    compensated: Callable[[jaxlie.SE3], FeaturePoints]
+    """The motion-compensated points, given the pose under trial. A pytree."""
+    T_predicted: jaxlie.SE3
+    params: Params
+
+    def points_at(self, T_target_lidar: jaxlie.SE3) -> FeaturePoints:
+        return self.compensated(T_target_lidar)
+
+    def frames(self) -> Frames:
+        # the last scan's own axes
+        here = Frame(jnp.zeros(3, jnp.int32), jnp.zeros_like(self.T_predicted.translation()))
+        return Frames(here, here)
+
+    def associate(self, points: FeaturePoints, T_target_lidar: jaxlie.SE3) -> LinesAndPlanes:
+        """Find lines and planes.
+
+        A sharp point lies on the line through the nearest less sharp point and the nearest one of another
+        ring; a flat point lies on the plane through the nearest less flat point, the next one of its ring and
+        the nearest one of another ring. A-LOAM's two loops, up and down the rings from the nearest point,
+        come to the same.
+        """
+        frame, corners = self.frames().corner, len(points.corner)
+        _, placed = frame.place(jnp.concatenate([points.corner, points.surface]), T_target_lidar)
+        mask = jnp.concatenate([points.corner_mask, points.surface_mask])
+        x, y, z = materialised(tuple(jnp.where(mask[:, None], placed, 0.0).astype(jnp.float32).T))
+        index = self.last.index
+        rings = len(index.elevation) // 2
+        lowest = jnp.where(jnp.arange(len(mask)) < corners, 0, rings).astype(jnp.int32)
+        limits = self.params.scan_to_scan
+        found = nearest_by_ring(
+            index,
+            Queries(x, y, z, lowest),
+            mask,
+            rings,
+            limits.radius.astype(jnp.float32),
+            limits.rings_apart.astype(jnp.float32),
+        )
+        at_corner, at_surface = (
+            jax.tree.map(lambda place, part=part: place[part], found)
+            for part in (slice(0, corners), slice(corners, None))
+        )
+        return LinesAndPlanes(_lines(index, at_corner), _planes(index, at_surface))
+
+
+def _lines(index: RingIndex, found: Nearest) -> Lines:
+    here, there = (index.at(jnp.maximum(place, 0)) for place in (found.nearest, found.other_ring))
+    along = _difference(there, here)
+    length = _length(along)
+    valid = (found.other_ring >= 0) & (length > 0)
+    direction = jnp.stack(along, -1) / jnp.where(valid, length, 1.0)[:, None]
+    return line_through(here, direction, valid)
+
+
+def _planes(index: RingIndex, found: Nearest) -> Planes:
+    places = (found.nearest, found.same_ring, found.other_ring)
+    here, along, aside = materialised(tuple(index.at(jnp.maximum(place, 0)) for place in places))
+    along, aside = _difference(along, here), _difference(aside, here)
+    normal = materialised(_cross(along, aside))
+    area = _length(normal)
+    valid = (found.same_ring >= 0) & (found.other_ring >= 0) & (area > 0)
+    nx, ny, nz = (axis / jnp.where(valid, area, 1.0) for axis in normal)
+    offset = -(nx * here[0] + ny * here[1] + nz * here[2])
+    return Planes(jnp.stack([nx, ny, nz], -1), offset, valid)
+
+
+def _difference(left: _Vectors, right: _Vectors) -> _Vectors:
+    return left[0] - right[0], left[1] - right[1], left[2] - right[2]
+
+
+def _cross(left: _Vectors, right: _Vectors) -> _Vectors:
+    (ax, ay, az), (bx, by, bz) = left, right
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+def _length(vector: _Vectors) -> Array:
+    return jnp.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)

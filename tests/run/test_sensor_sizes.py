@@ -1,0 +1,48 @@
+"""Sizes of the feature arrays by a recording's first scan."""
+
+import numpy as np
+import pytest
+
+from lio_jax.core.config import FeaturesConfig
+from lio_jax.core.settings import recipe_settings, with_overrides
+from lio_jax.data.sequence import LidarScan
+from lio_jax.run.sensor_sizes import with_sensor_sizes
+
+LOAM = recipe_settings("loam")
+
+
+def scan(rings: int, per_ring: int) -> LidarScan:
+    ring = np.repeat(np.arange(rings, dtype=np.int32), per_ring)
+    none = np.zeros(len(ring), np.float32)
+    return LidarScan(0, np.ones((len(ring), 3), np.float32), none, ring, none, 0.1)
+
+
+@pytest.mark.parametrize(("beams", "rings"), [(8, 8), (16, 16), (40, 40), (64, 64), (128, 128)])
+def test_the_arrays_hold_every_ring_of_the_first_scan_with_points(beams, rings):
+    settings, said = with_sensor_sizes(LOAM, [scan(0, 0), scan(beams, 900)])
+    features = settings.config.features
+    assert features.rings == rings
+    assert 900 < features.columns < 1200
+    assert 0 < features.surface_points <= 49152
+    (sentence,) = said
+    assert sentence.startswith(f"Sizes by the first scan: config.features.rings={rings}, ")
+    assert sentence.endswith(f"config.features.surface_points={features.surface_points}.")
+
+
+def test_what_is_given_stays():
+    given = with_overrides(LOAM, ["config.features.rings=32", "config.features.surface_points=1000"])
+    settings, _ = with_sensor_sizes(given, [scan(64, 900)])
+    assert (settings.config.features.rings, settings.config.features.surface_points) == (32, 1000)
+    fixed = with_overrides(given, ["config.features.columns=640"])
+    assert with_sensor_sizes(fixed, iter(())) == (fixed, [])
+
+
+@pytest.mark.parametrize("scans", [[], [scan(0, 0)]])
+def test_a_recording_without_points_gets_the_usual_sizes(scans):
+    features = with_sensor_sizes(LOAM, scans)[0].config.features
+    assert (features.rings, features.columns) == (FeaturesConfig().rings, FeaturesConfig().columns)
+
+
+def test_rings_of_a_few_points_leave_room_for_a_neighbourhood():
+    features = with_sensor_sizes(LOAM, [scan(16, 3)])[0].config.features
+    assert features.columns > 2 * features.neighbours
