@@ -59,7 +59,7 @@ class RunResult:
 
 
 def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list[str]]:
-    """Take from the recording what was not given, and say so: T_imu_lidar, sizes of voxels and of features."""
+    """Take from the recording what was not given, and say so: T_imu_lidar, sizes of voxels and features."""
     settings, calibration = _calibrated(sequence, settings)
     settings, fitted = fitted_to_surroundings(sequence, settings)
     settings, sizes = with_sensor_sizes(settings, sequence.scans())
