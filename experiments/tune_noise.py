@@ -1,12 +1,12 @@
 """Find known noise again without ground truth, and judge it on recordings that it was not tuned on.
 
     python experiments/tune_noise.py [--worlds street city] [--seeds 0 1 2] [--held-out 100 101 102]
-        [--seconds 20] [--factors 10 0.1] [--objectives noise] [--simplex] [--json FILE]
+        [--seconds 20] [--factors 10 0.1] [--objectives noise] [--iterations 28] [--simplex] [--json FILE]
 
 Simulates recordings of a MEMS sensor, starts with all noise FACTOR times its true value and tunes on each
-recording by itself. Four tables: what was found over what is true; what the tuned filter says of itself on
-the held-out recordings; its trajectory there; and, with --simplex, the loss by scans processed beside that
-of Nelder & Mead's method.
+recording by itself. Tables: what was found over what is true; what the tuned filter says of itself on the
+held-out recordings, and its trajectory's error there; and, with --simplex, the loss by scans processed beside
+that of Nelder & Mead's method. All worlds run with the first one's voxels.
 """
 
 import argparse
@@ -62,7 +62,7 @@ class Judged:
 class Workshop:
     """Recordings and compiled programs, shared by all tunings of one objective."""
 
-    def __init__(self, seconds: float, objective: str) -> None:
+    def __init__(self, seconds: float, objective: str, world: str) -> None:
         from lio_jax.tuning.loss import Loss
         from lio_jax.tuning.named_objectives import objective_named
         from lio_jax.tuning.parameters import free_parameters
@@ -70,7 +70,7 @@ class Workshop:
 
         self.seconds = seconds
         self._recordings: dict[tuple[str, int], Any] = {}
-        self.settings = self._settings(self._sequence("street", 0))
+        self.settings = self._settings(self._sequence(world, 0))
         self.free = free_parameters(self.settings.params(), TUNED)
         named = objective_named(objective)
         arguments = (self.settings.recipe, self.settings.config, self.free, named.objective)
@@ -214,7 +214,7 @@ def main() -> None:
 
 def tables(objective: str, options: argparse.Namespace) -> dict[str, Any]:
     """Tune, judge and print for one objective."""
-    shop = Workshop(options.seconds, objective)
+    shop = Workshop(options.seconds, objective, options.worlds[0])
     names = [name.split(".")[1] for name in shop.free.names]
     true = np.array([np.log(TRUE.get(name, 1.0)) for name in shop.free.names])
     print(f"\nobjective {objective}: found / true [95 % interval]; information_scale as it is")

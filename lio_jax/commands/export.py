@@ -59,6 +59,8 @@ def export(
     count = _written(out, to, bag_format, sequence, chain([first], streamed), layout, config, overwrite)
     for warning in sequence.warnings_so_far:
         say(f"warning: {warning}")
+    for note in _left_out(out, to, sequence):
+        say(f"note: {note}")
     print(f"recording  {out}  ({bag_format if to == 'bag' else to})\nscans      {count}")
     if hint := _reading_hint(to, first):
         print(f"run it     lio-jax run {out} {hint} --out DIR")
@@ -120,6 +122,18 @@ def _write_bag(
         return write_bag(
             out, sequence, bag_format=bag_format, layout=layout, scans=scans, overwrite=overwrite
         )
+
+
+def _left_out(out: Path, to: Target, sequence: Sequence) -> list[str]:
+    """Return sentences on what the recording holds and the format does not."""
+    if to != "kitti":
+        return []
+    has = {"inertial samples": sequence.imu(), "GPS fixes": sequence.gps()}
+    there = [name for name, data in has.items() if data is not None]
+    notes = [f"a KITTI odometry sequence holds no {' and no '.join(there)}; left out."] if there else []
+    if sequence.truth() is not None and not (out / "poses.txt").exists():
+        notes.append("the truth does not cover the scans; no poses.txt was written.")
+    return notes
 
 
 def _reading_hint(to: Target, first: LidarScan) -> str:

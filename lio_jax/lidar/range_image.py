@@ -56,11 +56,11 @@ def range_image(config: FeaturesConfig, params: Params, scan: Scan) -> RangeImag
     place = wanted & (scan.ring < config.rings)
     missed = jnp.sum(wanted & ~place, dtype=jnp.int32)
     if config.order == "azimuth":
-        return _byazimuth(config, scan, place, missed)
+        return _by_azimuth(config, scan, place, missed)
     return _by_arrival(config, scan, place, missed)
 
 
-def _byazimuth(
+def _by_azimuth(
     config: FeaturesConfig, scan: Scan, place: Bool[Array, " n"], missed: Int32[Array, ""]
 ) -> RangeImage:
     rings, columns, n = config.rings, config.columns, scan.ring.shape[0]

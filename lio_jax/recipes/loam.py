@@ -133,9 +133,11 @@ def step(
     with jax.named_scope("scan_to_scan"):
         picks = _Compensated(features.sharp, features.flat, motion, config.loam.compensate)
         prediction = jaxlie.SE3.exp(elapsed * state.twist)
+        # no velocity is known yet
+        opening = (state.scans == 1) | jnp.all(state.twist == 0)
         odometry = match_in_rounds(
             ScanToScan(last=state.map.last, compensated=picks, T_predicted=prediction, params=params),
-            jnp.where(state.scans == 1, jnp.int32(config.loam.opening_rounds), jnp.int32(config.loam.rounds)),
+            jnp.where(opening, jnp.int32(config.loam.opening_rounds), jnp.int32(config.loam.rounds)),
             config.registration.max_iterations,
         )
         T_odom_lidar = state.T_odom_lidar @ odometry.T_world_lidar

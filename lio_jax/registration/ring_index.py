@@ -1,8 +1,9 @@
-"""The points of one scan nearest another's, ring by ring: exact, and quick because rings are sorted.
+"""The points of one scan nearest another's, ring by ring, quick because rings are sorted.
 
-Points are sorted by ring and by azimuth within each ring. A query looks at a window of each ring near its own
-elevation; where what lies outside might be nearer, at longer windows of more rings; and where even that is
-not sure, at all points. Several clouds share an index, each with rings of its own.
+Points are sorted by ring and by sector of azimuth within each ring. A query looks at a window of each ring
+near its own elevation; where what lies outside might be nearer, at longer windows of more rings; and where
+even that is not sure, at all points. What is sure takes a ring to be level, at its mean elevation. Several
+clouds share an index, each with rings of its own.
 """
 
 from collections.abc import Callable
@@ -29,6 +30,8 @@ _LAST_CHUNK = 8
 _SECTORS = 512
 """Parts of a ring that it is sorted into: few, so that a number of 32 bits holds ring, sector and row."""
 _QUARTER = np.float32(np.pi / 2)
+_ROUNDING = np.float32(1e-5)
+"""What an azimuth is rounded by at most, rad."""
 _TURN = np.float32(2 * np.pi)
 
 _Points = tuple[Float32[Array, " k"], Float32[Array, " k"], Float32[Array, " k"]]
@@ -330,9 +333,14 @@ class _Windows(eqx.Module):
         """Return a distance within which no point of the rings lies outside of the windows, m."""
         x, y, z = self.queries.x, self.queries.y, self.queries.z
         angle, level = azimuth(x, y), jnp.sqrt(x**2 + y**2)
+        sectors = self.search.index.sectors
+        own = _sector(angle, sectors)
         ends = (self._place(jnp.int32(step), slice(None)) for step in (0, self.length - 1))
-        before, after = (_take(self.search.index.azimuth, end) for end in ends)
-        gap = jnp.minimum(_turned(angle - before), _turned(after - angle))
+        # within a sector points are in any order, so the first and the last one may not be whole
+        first, last = (_sector(_take(self.search.index.azimuth, end), sectors) for end in ends)
+        before = jnp.where(first == own, 0.0, _turned(angle - _edge(first + 1, sectors)))
+        after = jnp.where(last == own, 0.0, _turned(_edge(last, sectors) - angle))
+        gap = jnp.minimum(before, after)
         aside = level * jnp.sin(jnp.minimum(gap, _QUARTER))
         lift = jnp.minimum(jnp.abs(self.elevation - azimuth(level, z)), _QUARTER)
         above = jnp.sqrt(level**2 + z**2) * jnp.sin(lift)
@@ -353,9 +361,14 @@ def _sector(angle: Array, sectors: int) -> Array:
     return jnp.clip(jnp.floor((angle / _TURN + 0.5) * sectors).astype(jnp.int32), 0, sectors - 1)
 
 
+def _edge(sector: Array, sectors: int) -> Array:
+    """Return the azimuth at which a sector begins, rad."""
+    return _TURN * (sector.astype(jnp.float32) / sectors - 0.5)
+
+
 def _turned(angle: Array) -> Array:
-    """Return an angle within 0 and one turn."""
-    return angle - _TURN * jnp.floor(angle / _TURN)
+    """Return an angle within 0 and one turn; one that rounding has made negative is 0."""
+    return jnp.maximum(angle - _TURN * jnp.floor((angle + _ROUNDING) / _TURN), 0.0)
 
 
 def _take(table: Array, index: Array) -> Array:

@@ -93,7 +93,7 @@ def spinning(rings: int, columns: int, seed: int) -> tuple[np.ndarray, np.ndarra
     return points.reshape(-1, 3)[order], np.repeat(np.arange(rings), columns)[order]
 
 
-@pytest.mark.parametrize(("rings", "columns"), [(16, 512), (64, 256), (8, 32)])
+@pytest.mark.parametrize(("rings", "columns"), [(16, 512), (64, 256), (8, 32), (16, 4096), (128, 2048)])
 @pytest.mark.parametrize("moved", [0.05, 1.5])
 def test_all_three_are_those_of_a_k_d_tree(rings, columns, moved):
     points, ring = spinning(rings, columns, seed=rings)

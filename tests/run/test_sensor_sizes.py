@@ -25,8 +25,14 @@ def test_the_arrays_hold_every_ring_of_the_first_scan_with_points(beams, rings):
     assert 900 < features.columns < 1200
     assert 0 < features.surface_points <= 49152
     (sentence,) = said
-    assert sentence.startswith(f"Sizes by the first scan: config.features.rings={rings}, ")
+    assert sentence.startswith(f"Sizes by the first scans: config.features.rings={rings}, ")
     assert sentence.endswith(f"config.features.surface_points={features.surface_points}.")
+
+
+def test_a_first_scan_that_is_cut_short_or_sees_the_lower_beams_alone_does_not_decide():
+    features = with_sensor_sizes(LOAM, [scan(16, 100), scan(8, 900), scan(32, 800)])[0].config.features
+    assert features.rings == 32
+    assert 900 < features.columns < 1200
 
 
 def test_what_is_given_stays():

@@ -1,5 +1,7 @@
 """Finer voxels where the surroundings are near, and only where nobody chose."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,29 +10,45 @@ from lio_jax.run.surroundings import NEAR_VALUES, fitted_to_surroundings
 from tests.run.small_drive import Replay, moving
 
 
-class At(Replay):
-    """A drive whose scans are scaled so that the median range is what it is told; some may be empty."""
+class Seeing(Replay):
+    """A drive on which every scan but the first few, which are empty, sees the same points."""
 
-    def __init__(self, median, empty=0):
+    def __init__(self, points, empty=0):
         super().__init__(moving())
-        self.median, self.empty = median, empty
+        self.points, self.empty = np.asarray(points, np.float32), empty
 
     def scans(self, start=0, count=None):
-        import dataclasses
-
         for number, scan in enumerate(super().scans(start, count)):
-            scale = self.median / np.median(np.linalg.norm(scan.points, axis=1))
-            points = (scale * scan.points).astype(np.float32)
-            points[0] = np.nan
-            kept = slice(0, 0) if number < self.empty else slice(None)
-            rows = {
-                name: value[kept]
-                for name, value in (("points", points), ("time", scan.time), ("ring", scan.ring))
-                if value is not None
-            }
-            if scan.intensity is not None:
-                rows["intensity"] = scan.intensity[kept]
-            yield dataclasses.replace(scan, **rows)
+            count_here = 0 if number < self.empty else len(self.points)
+            none = np.zeros(count_here, np.float32)
+            yield replace(
+                scan,
+                points=self.points[:count_here],
+                time=none,
+                ring=none.astype(np.int32),
+                intensity=none,
+            )
+
+
+def around(within):
+    """Return points in all directions, nine tenths of them within so many metres, and one that is none."""
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(2000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    ranges = within * rng.uniform(0.3, 1.0, (2000, 1)) / np.percentile(rng.uniform(0.3, 1.0, 2000), 90)
+    points = ranges * directions
+    points[0] = np.nan
+    return points
+
+
+def open_ground(height, elevations):
+    """Return what a sensor sees of a plain."""
+    down = np.deg2rad([angle for angle in elevations if angle < 0])
+    azimuth = np.linspace(0, 2 * np.pi, 360, endpoint=False)
+    level = height / np.tan(-down)[:, None]
+    points = np.stack(np.broadcast_arrays(level * np.cos(azimuth), level * np.sin(azimuth), -height), -1)
+    points = points.reshape(-1, 3)
+    return points[np.linalg.norm(points, axis=1) < 100]
 
 
 def values(settings):
@@ -39,29 +57,41 @@ def values(settings):
     return [float(getattr(getattr(params, section), name)) for section, name in paths]
 
 
-@pytest.mark.parametrize(("median", "near"), [(1.5, True), (4.9, True), (5.1, False), (12.0, False)])
-def test_voxels_are_fine_where_the_surroundings_are_near(median, near):
+@pytest.mark.parametrize(("within", "near"), [(2.0, True), (9.0, True), (11.0, False), (40.0, False)])
+def test_voxels_are_fine_where_the_surroundings_are_near(within, near):
     settings = recipe_settings("default")
-    fitted, notes = fitted_to_surroundings(At(median), settings)
+    fitted, notes = fitted_to_surroundings(Seeing(around(within)), settings)
     assert values(fitted) == pytest.approx(list(NEAR_VALUES.values()) if near else values(settings))
     assert len(notes) == near
     if near:
-        assert f"median range {median:.1f} m" in notes[0]
+        assert "90 % of the points within" in notes[0]
+
+
+@pytest.mark.parametrize(
+    ("height", "elevations"),
+    [(0.5, np.arange(-15, 16, 2)), (0.9, np.linspace(-22.5, 22.5, 64)), (1.8, np.linspace(-45, 45, 128))],
+    ids=["VLP-16 on a small robot", "OS1-64 on a cart", "OS0-128 on a car"],
+)
+def test_open_ground_next_to_a_low_sensor_is_no_room(height, elevations):
+    plain = Seeing(open_ground(height, elevations))
+    assert not fitted_to_surroundings(plain, recipe_settings("default"))[1]
 
 
 def test_an_empty_first_scan_does_not_decide():
-    assert fitted_to_surroundings(At(2.0, empty=2), recipe_settings("default"))[1]
-    assert not fitted_to_surroundings(At(2.0, empty=3), recipe_settings("default"))[1]
+    assert fitted_to_surroundings(Seeing(around(2.0), empty=2), recipe_settings("default"))[1]
+    assert not fitted_to_surroundings(Seeing(around(2.0), empty=3), recipe_settings("default"))[1]
 
 
 def test_what_was_given_stays():
     given = with_overrides(recipe_settings("default"), ("params.map.voxel_size=0.8",))
-    fitted, notes = fitted_to_surroundings(At(2.0), given)
+    fitted, notes = fitted_to_surroundings(Seeing(around(2.0)), given)
     assert float(fitted.params().map.voxel_size) == pytest.approx(0.8)
+    # the spacings are a street's, too, to go with it
+    assert float(fitted.params().map.point_spacing) == pytest.approx(0.25)
     assert float(fitted.params().lidar.min_range) == pytest.approx(0.5)
     assert "voxel_size 0.4" not in notes[0]
 
 
 def test_other_recipes_keep_their_systems_values():
     settings = recipe_settings("fast_lio2")
-    assert fitted_to_surroundings(At(2.0), settings) == (settings, [])
+    assert fitted_to_surroundings(Seeing(around(2.0)), settings) == (settings, [])
