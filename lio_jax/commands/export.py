@@ -13,7 +13,7 @@ from lio_jax.commands.runtime import say
 from lio_jax.commands.sim import truth_beside
 from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError, UsageError
-from lio_jax.data.bag_storage import BagFormat
+from lio_jax.data.bag_storage import FORMAT_OF_ENDING, BagFormat
 from lio_jax.data.bag_writer import write_bag
 from lio_jax.data.kitti_writer import write_kitti
 from lio_jax.data.native_writer import write_native
@@ -24,8 +24,6 @@ from lio_jax.data.whole_output import written_whole
 from lio_jax.run.run import check_start
 
 Target = Literal["bag", "kitti", "native"]
-
-_BAG_FORMATS: dict[str, BagFormat] = {".bag": "ros1", ".db3": "ros2-sqlite3", ".mcap": "ros2-mcap"}
 
 
 def export(
@@ -67,11 +65,11 @@ def export(
 
 
 def _bag_format(out: Path, to: Target) -> BagFormat:
-    if to == "bag" and out.suffix not in _BAG_FORMATS:
-        raise UsageError(f"{out}: a bag's name ends in {', '.join(_BAG_FORMATS)}; choose one of them.")
-    if to != "bag" and out.suffix in _BAG_FORMATS:
+    if to == "bag" and out.suffix not in FORMAT_OF_ENDING:
+        raise UsageError(f"{out}: a bag's name ends in {', '.join(FORMAT_OF_ENDING)}; choose one of them.")
+    if to != "bag" and out.suffix in FORMAT_OF_ENDING:
         raise UsageError(f"{out}: --to {to} writes a folder; leave out the ending {out.suffix}.")
-    return _BAG_FORMATS.get(out.suffix, "ros1")
+    return FORMAT_OF_ENDING.get(out.suffix, "ros1")
 
 
 def _written(

@@ -2,7 +2,7 @@
 
 import shlex
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from lio_jax.commands.sim_options import ErrorOptions, Format, MotionOptions, SensorOptions
 from lio_jax.core.errors import UsageError
-from lio_jax.data.bag_storage import BagFormat, check_ending
+from lio_jax.data.bag_storage import FORMAT_OF_ENDING, BagFormat, check_ending
 from lio_jax.data.bag_writer import write_bag
 from lio_jax.data.native_writer import write_native
 from lio_jax.data.sequence import LidarScan
@@ -29,7 +29,6 @@ from lio_jax.sim.lidar import Lidar
 from lio_jax.sim.sensors import find_sensor
 from lio_jax.sim.sequence import SimulatedSequence
 
-_FORMAT_OF: dict[str, Format] = {".bag": "ros1", ".db3": "ros2-sqlite3", ".mcap": "ros2-mcap"}
 _DURATION = 60.0
 """Unless asked otherwise or set by a trajectory, s."""
 
@@ -47,7 +46,8 @@ def sim(
     errors: ErrorOptions,
 ) -> None:
     """Simulate one recording from the command line."""
-    chosen = wanted or _FORMAT_OF.get(out.suffix, "native")
+    of_ending: Mapping[str, Format] = FORMAT_OF_ENDING
+    chosen = wanted or of_ending.get(out.suffix, "native")
     _check_output(out, chosen, overwrite)
     sequence = _sequence(world, sensor, duration, seed, motion, sensors, errors)
     began = time.perf_counter()
@@ -73,19 +73,19 @@ def sim(
 
 def truth_beside(bag: Path) -> tuple[Path, Path]:
     """Return where the truth of a bag lies: poses as TUM, everything else as npz."""
-    stem = bag.stem if bag.suffix in _FORMAT_OF else bag.name
+    stem = bag.stem if bag.suffix in FORMAT_OF_ENDING else bag.name
     return bag.with_name(f"{stem}.truth.tum"), bag.with_name(f"{stem}.truth.npz")
 
 
 def _check_output(out: Path, chosen: Format, overwrite: bool) -> None:
     """Refuse at once what would be refused after a long simulation."""
     if chosen == "native":
-        if out.suffix in _FORMAT_OF:
+        if out.suffix in FORMAT_OF_ENDING:
             raise UsageError(f"{out}: a native recording is a folder; leave out the ending or the format.")
         check_free(out, overwrite, "meta.yaml")
         return
     check_ending(out, chosen)
-    check_free(out, overwrite, "" if out.suffix in _FORMAT_OF else "metadata.yaml")
+    check_free(out, overwrite, "" if out.suffix in FORMAT_OF_ENDING else "metadata.yaml")
     for path in truth_beside(out):
         check_free(path, overwrite)
 

@@ -95,12 +95,12 @@ class FeaturesConfig:
 
     rings: int = 64
     """Rings of the sensor; points of a ring beyond are reported as dropped. 0: by the recording's first
-    scan."""
+    scans."""
     ring_step: int = 1
     """Every how many rings one is used."""
     columns: int = 2304
     """Columns of a full turn where points are ordered by azimuth; else the points a ring has room for. 0: by
-    the recording's first scan."""
+    the recording's first scans."""
     order: Literal["arrival", "azimuth"] = "arrival"
     """How a ring's points follow each other: as the recording has them (A-LOAM; the lines of a Livox), or by
     columns of equal azimuth, of which the first point takes each (LIO-SAM)."""
@@ -116,7 +116,7 @@ class FeaturesConfig:
     flat: int = 4
     """Flattest points of a sector, which are matched against the surfaces."""
     surface_points: int = 49152
-    """Capacity of the downsampled surface points. 0: by the recording's first scan."""
+    """Capacity of the downsampled surface points. 0: by the recording's first scans."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
 BagFormat = Literal["ros1", "ros2-sqlite3", "ros2-mcap"]
 
+FORMAT_OF_ENDING: dict[str, BagFormat] = {".bag": "ros1", ".db3": "ros2-sqlite3", ".mcap": "ros2-mcap"}
+"""What the ending of a bag's name tells."""
+
 _ENDINGS: dict[str, tuple[str, ...]] = {
     "ros1": (".bag",),
     "ros2-sqlite3": (".db3", ""),

@@ -1,7 +1,5 @@
 """Values that follow from how near a recording's surroundings are."""
 
-from itertools import islice
-
 import numpy as np
 
 from lio_jax.core.settings import Settings
@@ -46,7 +44,7 @@ def fitted_to_surroundings(sequence: Sequence, settings: Settings) -> tuple[Sett
 
 def _reach(sequence: Sequence) -> float | None:
     """Return the range within which most points of the first scan that has any lie, m."""
-    for scan in islice(sequence.scans(0, _LOOKED_AT), _LOOKED_AT):
+    for scan in sequence.scans(0, _LOOKED_AT):
         ranges = np.linalg.norm(scan.points, axis=1)
         ranges = ranges[np.isfinite(ranges) & (ranges > _OWN_BODY_M)]
         if len(ranges):
