@@ -45,7 +45,7 @@ class LidarConfig:
 
     buckets: tuple[int, ...] = (4096, 8192, 16384, 32768, 65536, 98304, 131072, 196608, 262144)
     """Padded scan sizes; a scan takes the smallest that holds it, a larger one is thinned to the last."""
-    registration_points: int = 8192
+    registration_points: int = 12288
     """Capacity of the downsampled scan that is registered."""
     insertion_points: int = 32768
     """Capacity of the downsampled scan that is written into the map."""

@@ -88,6 +88,8 @@ class RegistrationParams(eqx.Module):
 
     point_spacing: Scalar
     """The scan is thinned to one point per cube of this edge before it is matched, m."""
+    inertial_point_spacing: Scalar
+    """The same in a filter on the voxels' planes, whose prediction needs fewer points to correct it, m."""
     kernel: Scalar
     """Scale of the robust kernel, m: Geman-McClure's; in loam Huber's."""
     information_scale: Scalar
@@ -265,7 +267,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "reach": 120.0,
     },
     "registration": {
-        "point_spacing": 0.5,
+        "point_spacing": 0.4,
+        "inertial_point_spacing": 0.5,
         "kernel": 0.15,
         "information_scale": 0.03,
         "reassociation_distance": 0.015,

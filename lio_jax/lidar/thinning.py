@@ -23,12 +23,19 @@ class ThinnedScan(eqx.Module):
     """Occupied cells beyond the capacities."""
 
 
-def thinned(params: Params, scan: Scan, insertion_points: int, registration_points: int) -> ThinnedScan:
+def thinned(
+    params: Params,
+    scan: Scan,
+    registration_spacing: Float[Array, ""],
+    insertion_points: int,
+    registration_points: int,
+) -> ThinnedScan:
     """Return the scan within its range limits, thinned to the spacings of map and registration.
 
     Args:
-        params: range limits and spacings.
+        params: range limits and the map's spacing.
         scan: padded sweep.
+        registration_spacing: of the points to match, m.
         insertion_points: capacity for the map.
         registration_points: capacity of those to match.
     """
@@ -37,7 +44,7 @@ def thinned(params: Params, scan: Scan, insertion_points: int, registration_poin
     mask = scan.mask & (squared_range > near**2) & (squared_range < far**2)
     chosen = select_per_voxel(scan.points, mask, params.map.point_spacing, insertion_points)
     points = scan.points[chosen.index]
-    matched = select_per_voxel(points, chosen.mask, params.registration.point_spacing, registration_points)
+    matched = select_per_voxel(points, chosen.mask, registration_spacing, registration_points)
     return ThinnedScan(
         points, scan.time[chosen.index], chosen.mask, matched, chosen.dropped + matched.dropped
     )

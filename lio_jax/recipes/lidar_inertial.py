@@ -80,7 +80,8 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
         imu: samples around that time.
     """
     first = state.scans == 0
-    thin = thinned(params, scan, config.imu.insertion_points, config.imu.registration_points)
+    spacing = params.registration.inertial_point_spacing
+    thin = thinned(params, scan, spacing, config.imu.insertion_points, config.imu.registration_points)
     with jax.named_scope("predict"):
         prior, path = predicted(params, state.uncertain, scan, imu, first)
         T_predicted = lidar_pose(prior.nav)

@@ -71,7 +71,8 @@ def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[Stat
         scan: padded sweep; ``scan.interval`` is the time since the last scan's end.
     """
     with jax.named_scope("thin"):
-        thin = thinned(params, scan, config.lidar.insertion_points, config.lidar.registration_points)
+        spacing = params.registration.point_spacing
+        thin = thinned(params, scan, spacing, config.lidar.insertion_points, config.lidar.registration_points)
         delay = thin.time - 0.5 * scan.duration
         matched = thin.matched
     with jax.named_scope("predict"):

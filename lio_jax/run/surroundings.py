@@ -17,6 +17,7 @@ NEAR_VALUES = {
     "params.map.voxel_size": 0.4,
     "params.map.point_spacing": 0.1,
     "params.registration.point_spacing": 0.2,
+    "params.registration.inertial_point_spacing": 0.2,
 }
 _TOGETHER = {path for path in NEAR_VALUES if path != "params.lidar.min_range"}
 """Of the recipe ``default``. With its values for streets, voxels hold more than one wall: on 20 s of walking
