@@ -17,6 +17,7 @@ from lio_jax.core.error_state import (
     GRAVITY,
     POSITION,
     ROTATION,
+    VELOCITY,
     Swept,
     Uncertain,
     sphere_basis,
@@ -94,9 +95,27 @@ def predicted(
     dtype = last.covariance.dtype
     end = scan.duration.astype(dtype)
     start = jnp.where(first, 0.0, end - scan.interval.astype(dtype))
-    moved, path = propagate_sweep(last, imu, params.imu, start, end, jnp.asarray(sweep_start, dtype))
+    sweep_start = jnp.asarray(sweep_start, dtype)
+    moved, path = propagate_sweep(last, imu, params.imu, start, end, sweep_start)
     # the first scan's end is the world's origin: its samples only deskew it
-    return jax.tree.map(lambda new, old: jnp.where(first, old, new), moved, Swept.at_once(last)), path
+    opened = _held_at_mean(last, jnp.where(jnp.any(scan.mask), end - sweep_start, 0.0))
+    return jax.tree.map(lambda new, old: jnp.where(first, old, new), moved, Swept.at_once(opened)), path
+
+
+def _held_at_mean(state: Uncertain, sweep: Float[Array, ""]) -> Uncertain:
+    """Return a first state that is certain in its sweep's mean instead of its end.
+
+    A wrong velocity shifts the first scan in the map by what it shifts the mean of the second by, seen from
+    its end; without this correlation a vehicle that moves from the start would seem twice as fast.
+
+    Args:
+        state: at the sweep's end.
+        sweep: its duration, s.
+    """
+    identity = jnp.eye(DOF, dtype=state.covariance.dtype)
+    carried = identity.at[POSITION, VELOCITY].set(sweep / 2 * jnp.eye(3, dtype=identity.dtype))
+    covariance = carried @ state.covariance @ carried.T
+    return Uncertain(state.nav, (covariance + covariance.T) / 2)
 
 
 @runtime_checkable

@@ -102,6 +102,17 @@ def test_a_moving_start_is_found():
     assert moving.ate < 0.08
 
 
+def test_full_speed_is_known_from_the_second_scan_on():
+    moving = drive("street", 2.0, moving_start=True)
+    speeds = np.linalg.norm(np.diff(moving.truth[:, :3, 3], axis=0), axis=1) / 0.1
+    assert speeds[0] > 4
+    found = [np.linalg.norm(item.nav.velocity) for item in moving.tracked[2:]]
+    np.testing.assert_allclose(found, speeds[1:], atol=0.4)
+    sigma = np.sqrt(np.diagonal(moving.covariance[2])[6:9]).max()
+    assert np.linalg.norm(found[0] - speeds[1]) < 4 * sigma
+    assert moving.ate < 0.03
+
+
 def wrong(T: np.ndarray) -> np.ndarray:
     """Return an extrinsic that is off by 5 degrees and 10 cm."""
     T = T.copy()
