@@ -148,6 +148,24 @@ class LoamConfig:
 
 
 @dataclass(frozen=True)
+class LioSamConfig:
+    """What the recipe lio_sam has of its own."""
+
+    window: int = 10
+    """States that are smoothed together; what is older is marginalised."""
+    smoother_iterations: int = 5
+    """Linearisations of the window at most."""
+    lidar_noise: Literal["fixed", "information"] = "fixed"
+    """What the smoother believes of a scan match: the sigmas of ``params.smoother``, or its information."""
+    keyframes: int = 256
+    """Capacity; where it is reached the oldest is forgotten, such as it is not needed any more first."""
+    corner_points: int = 2048
+    """Capacity of the corners that are matched with the map, after thinning."""
+    surface_points: int = 8192
+    """Capacity of the surface points that are matched with the map, after thinning."""
+
+
+@dataclass(frozen=True)
 class OutputConfig:
     """Which of the optional files a run folder gets."""
 
@@ -176,6 +194,7 @@ class Config:
     features: FeaturesConfig = field(default_factory=FeaturesConfig)
     fast_lio2: FastLio2Config = field(default_factory=FastLio2Config)
     loam: LoamConfig = field(default_factory=LoamConfig)
+    lio_sam: LioSamConfig = field(default_factory=LioSamConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
 
 

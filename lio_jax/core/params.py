@@ -183,6 +183,46 @@ class CubeGridParams(eqx.Module):
     """Along z."""
 
 
+class SubmapParams(eqx.Module):
+    """Keyframes, and those of them around the vehicle that scans are matched with."""
+
+    keyframe_distance: Scalar
+    """A scan this far from the last keyframe becomes one, m ..."""
+    keyframe_angle: Scalar
+    """... or one turned by this much, rad."""
+    radius: Scalar
+    """Keyframes within this distance are matched with, m ..."""
+    spacing: Scalar
+    """... but one per so many metres only ..."""
+    recent: Scalar
+    """... and all of the last so many seconds."""
+
+
+class SmootherParams(eqx.Module):
+    """What a scan match says to the smoother, and the smoother to the next scan match."""
+
+    rotation_sigma: Scalar
+    """Of a scan match's rotation, rad, where the sigmas are fixed."""
+    translation_sigma: Scalar
+    """Of its position, m."""
+    degenerate_sigma: Scalar
+    """Of both, rad and m, where it was degenerate."""
+    kernel: Scalar
+    """Scale of the robust kernel on scan matches, sigmas."""
+    position_sigma: Scalar
+    """Of the first position, m."""
+    tolerance: Scalar
+    """The smoother has converged when the next step would be shorter than this, sigmas."""
+    tilt_weight: Scalar
+    """Share by which the matched roll and pitch are drawn to the inertial ones."""
+    tilt_limit: Scalar
+    """Larger roll and pitch are cut off there, rad."""
+    height_limit: Scalar
+    """The same for z, m."""
+    mapping_interval: Scalar
+    """Least time between two scan matches, s; in between the inertial prediction stands."""
+
+
 class MotionParams(eqx.Module):
     """The constant-velocity prediction between scans."""
 
@@ -235,6 +275,8 @@ class Params(eqx.Module):
     features: FeatureParams
     point_map: PointMapParams
     cubes: CubeGridParams
+    submap: SubmapParams
+    smoother: SmootherParams
     motion: MotionParams
     limits: LimitParams
     extrinsics: ExtrinsicsParams
@@ -305,6 +347,25 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "matched_across": 5.0,
         "matched_up": 3.0,
     },
+    "submap": {
+        "keyframe_distance": 1.0,
+        "keyframe_angle": 0.2,
+        "radius": 50.0,
+        "spacing": 2.0,
+        "recent": 10.0,
+    },
+    "smoother": {
+        "rotation_sigma": 0.05,
+        "translation_sigma": 0.1,
+        "degenerate_sigma": 1.0,
+        "kernel": 10.0,
+        "position_sigma": 0.01,
+        "tolerance": 1e-3,
+        "tilt_weight": 0.01,
+        "tilt_limit": 1000.0,
+        "height_limit": 1000.0,
+        "mapping_interval": 0.0,
+    },
     "motion": {"initial_error": 2.0, "error_decay": 0.5},
     "limits": {"speed": 30.0, "gyro_bias": 1.0, "accel_bias": 1.0, "outage": 1.0},
     "extrinsics": {"rotation": [0.0, 0.0, 0.0, 1.0], "translation": [0.0, 0.0, 0.0], "time_offset": 0.0},
@@ -348,6 +409,7 @@ DIFFERENTIABLE = (
     "lidar.angle_sigma",
     "registration.kernel",
     "registration.information_scale",
+    *(f"smoother.{name}" for name in ("rotation_sigma", "translation_sigma", "degenerate_sigma")),
     *(f"extrinsics.{name}" for name in DEFAULTS["extrinsics"]),
 )
 """Leaves with a derivative. The others choose: which points, which voxels, when to stop, what to report."""
@@ -362,6 +424,10 @@ _MAY_BE_ZERO = {
     "knn.min_score",
     "point_map.cube_margin",
     "point_map.nearer_by",
+    "submap.spacing",
+    "submap.recent",
+    "smoother.tilt_weight",
+    "smoother.mapping_interval",
     "motion.initial_error",
     "registration.degeneracy_ratio",
     "registration.inertial_degeneracy_ratio",
@@ -369,6 +435,7 @@ _MAY_BE_ZERO = {
 }
 _AT_MOST_ONE = {
     "knn.min_score",
+    "smoother.tilt_weight",
     "motion.error_decay",
     "registration.degeneracy_ratio",
     "registration.inertial_degeneracy_ratio",

@@ -7,6 +7,8 @@ _IMU_RATE = 200.0
 """FAST-LIO2 adds cov dt^2 to its covariance in each step of dt = 1 / rate; a density s adds s^2 dt. So
 s = sqrt(cov / rate), here at the rate of its example recordings, Hz. Its bias walks convert alike."""
 
+_DEGREE = 3.141592653589793 / 180
+
 RECIPE_VALUES: dict[str, dict[str, Any]] = {
     "default": {},
     "fast_lio2": {
@@ -55,6 +57,40 @@ RECIPE_VALUES: dict[str, dict[str, Any]] = {
         "params.registration.degeneracy_ratio": 1e-4,
         "params.knn.radius": 1.0,
         "params.knn.plane_tolerance": 0.2,
+    },
+    "lio_sam": {
+        # by the recording
+        "config.features.rings": 0,
+        "config.features.columns": 0,
+        "config.features.surface_points": 0,
+        "config.features.order": "azimuth",
+        "config.map.capacity": 65536,
+        "config.registration.max_iterations": 30,
+        "params.imu.gyro_noise": 1.5636343949698187e-03,
+        "params.imu.accel_noise": 3.9939570888238808e-03,
+        "params.imu.gyro_bias_walk": 3.5640318696367613e-05,
+        "params.imu.accel_bias_walk": 6.4356659353532566e-05,
+        "params.imu.gravity": 9.80511,
+        "params.initial.rotation_sigma": 1e-2,
+        "params.initial.velocity_sigma": 1e4,
+        "params.initial.gyro_bias_sigma": 1e-3,
+        "params.initial.accel_bias_sigma": 1e-3,
+        "params.lidar.min_range": 1.0,
+        "params.lidar.max_range": 1000.0,
+        "params.map.voxel_size": 0.4,
+        "params.map.corner_voxel_size": 0.2,
+        "params.features.corner_threshold": 1.0,
+        "params.features.flat_threshold": 0.1,
+        "params.features.surface_spacing": 0.4,
+        "params.registration.reassociation_distance": 0.05,
+        "params.registration.rotation_tolerance": 0.05 * _DEGREE,
+        "params.registration.translation_tolerance": 5e-4,
+        "params.knn.radius": 1.0,
+        "params.knn.plane_tolerance": 0.2,
+        "params.knn.min_score": 0.1,
+        # keyframes within 50 m see farther than that
+        "params.point_map.cube_side_length": 400.0,
+        "params.point_map.cube_margin": 0.1,
     },
 }
 """By recipe; paths as in a settings file."""

@@ -24,15 +24,10 @@ from lio_jax.lidar.deskew import deskew_constant_velocity
 from lio_jax.lidar.features import FeatureCloud, LoamFeatures, loam_features
 from lio_jax.lidar.voxel_mean import mean_per_voxel
 from lio_jax.recipes.output import Output
-from lio_jax.registration.cube_map import (
-    CubeMap,
-    ScanToMap,
-    added_to,
-    empty_cube_map,
-    frames_at,
-)
+from lio_jax.registration.cube_map import ScanToCubes, added_to
+from lio_jax.registration.feature_map import FeatureMap, empty_feature_map, frames_at, placed_in
 from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES, Registration
-from lio_jax.registration.lines_and_planes import FeaturePoints, Frames
+from lio_jax.registration.lines_and_planes import FeaturePoints
 from lio_jax.registration.rounds import match_in_rounds
 from lio_jax.registration.scan_to_scan import LastScan, ScanToScan, empty_scan, last_scan
 
@@ -40,7 +35,7 @@ from lio_jax.registration.scan_to_scan import LastScan, ScanToScan, empty_scan, 
 class Targets(eqx.Module):
     """What scans are matched with: constants of the derivative."""
 
-    cubes: CubeMap
+    cubes: FeatureMap
     last: LastScan
     """In the lidar frame of the last scan's middle."""
 
@@ -89,7 +84,7 @@ def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
         twist=jnp.zeros(6, dtype),
         scans=jnp.int32(0),
         map=Targets(
-            empty_cube_map(config.map.capacity),
+            empty_feature_map(config.map.capacity),
             empty_scan(corners, features.surface_points, features.rings),
         ),
     )
@@ -153,7 +148,8 @@ def step(
     with jax.named_scope("insert"):
         # the map is a constant of the derivative
         last = _last(config, features, motion, jax.lax.stop_gradient(odometry.T_world_lidar))
-        frames, placed = jax.lax.stop_gradient(_placed(params, thin, T))
+        frames = frames_at(jax.lax.stop_gradient(T.translation()), params)
+        placed = jax.lax.stop_gradient(placed_in(frames, thin, T))
         cubes, *added = added_to(state.map.cubes, placed, its_turn & ~lost, frames, params)
 
     T_world_imu = T @ jaxlie.SE3.exp(middle * twist) @ params.extrinsics.T_imu_lidar().inverse()
@@ -262,7 +258,7 @@ def _thinned(
 def _mapped(
     config: Config,
     params: Params,
-    cubes: CubeMap,
+    cubes: FeatureMap,
     points: FeaturePoints,
     guess: jaxlie.SE3,
     odometry: Registration,
@@ -271,7 +267,7 @@ def _mapped(
     """Return the match with the map, or that with the last scan if it is not the map's turn."""
 
     def with_map() -> Registration:
-        task = ScanToMap(
+        task = ScanToCubes(
             map=cubes, points=points, T_predicted=guess, params=params, neighbours=config.knn.neighbours
         )
         found = match_in_rounds(task, config.loam.rounds, config.registration.max_iterations)
@@ -293,11 +289,3 @@ def _last(config: Config, features: LoamFeatures, motion: _Motion, T_last_lidar:
         motion.at_middle(cloud, T_last_lidar) if config.loam.compensate else cloud.points for cloud in clouds
     )
     return last_scan(*clouds, corner.astype(jnp.float32), surface.astype(jnp.float32), config.features.rings)
-
-
-def _placed(params: Params, points: FeaturePoints, T: jaxlie.SE3) -> tuple[Frames, FeaturePoints]:
-    """Return the points in the frames of the maps near a pose."""
-    frames = frames_at(T.translation(), params)
-    _, corner = frames.corner.place(points.corner, T)
-    _, surface = frames.surface.place(points.surface, T)
-    return frames, FeaturePoints(corner, points.corner_mask, surface, points.surface_mask)

@@ -5,6 +5,7 @@ d1^2 + d2^2 and all residuals are alike.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -131,14 +132,42 @@ Weight = Callable[[Float[Array, " k"], Float[Array, " k"]], Float[Array, " k"]]
 """Of a residual, by its squared distance and the point's squared range, m^2."""
 
 
-def huber(kernel: Float[Array, ""]) -> Weight:
-    """Return Huber's weight of a distance, 1 up to the kernel and kernel / distance beyond (m)."""
+class Weights(NamedTuple):
+    """Robust weights of either kind's distances."""
+
+    corner: Weight
+    """A line's two distances share one."""
+    surface: Weight
+
+
+def huber(kernel: Float[Array, ""]) -> Weights:
+    """Return Huber's weight of any distance, 1 up to the kernel and kernel / distance beyond (m)."""
 
     def weight(squared_distance: Float[Array, " k"], _: Float[Array, " k"]) -> Float[Array, " k"]:
         scale = kernel.astype(squared_distance.dtype)
         return scale / jnp.sqrt(jnp.maximum(squared_distance, scale**2))
 
-    return weight
+    return Weights(weight, weight)
+
+
+def scored(knn: KnnParams) -> Weights:
+    """Return LIO-SAM's weights: the squared score s of a match, or 0 where it is not above ``min_score``.
+
+    s = 1 - w d for a corner and 1 - w d / sqrt(r) for a surface point at range r (``distance_weight`` w); it
+    multiplies distance and derivative.
+    """
+
+    def weight(squared_distance: Float[Array, " k"], scale: Float[Array, " k"] | float) -> Float[Array, " k"]:
+        dtype = squared_distance.dtype
+        # the square root's slope is infinite at 0
+        distance = jnp.sqrt(jnp.maximum(squared_distance, 1e-12))
+        score = 1 - knn.distance_weight.astype(dtype) * distance / scale
+        return jnp.where(score > knn.min_score.astype(dtype), score**2, 0.0)
+
+    return Weights(
+        lambda squared, _: weight(squared, 1.0),
+        lambda squared, range_squared: weight(squared, jnp.maximum(range_squared, 1e-6) ** 0.25),
+    )
 
 
 def linearise(
@@ -146,7 +175,7 @@ def linearise(
     points: FeaturePoints,
     T_world_lidar: jaxlie.SE3,
     frames: Frames,
-    weight: Weight,
+    weights: Weights,
     range_sigma: Float[Array, ""],
 ) -> NormalEquations:
     """Return the weighted normal equations of the points' distances from their lines and planes at a pose.
@@ -156,7 +185,7 @@ def linearise(
         points: m, lidar frame.
         T_world_lidar: the pose.
         frames: of the matches.
-        weight: robust weight; a line's two distances share one.
+        weights: robust weights.
         range_sigma: standard deviation of a distance, m.
     """
     lines, planes = matches.lines, matches.planes
@@ -165,8 +194,8 @@ def linearise(
     surface = _Rows.of(planes, points.surface, T_world_lidar, frames.surface)
     corner_squared = across_first.distance**2 + across_second.distance**2
     surface_squared = surface.distance**2
-    at_corner = lines.first.valid * weight(corner_squared, across_first.range_squared)
-    at_surface = planes.valid * weight(surface_squared, surface.range_squared)
+    at_corner = lines.first.valid * weights.corner(corner_squared, across_first.range_squared)
+    at_surface = planes.valid * weights.surface(surface_squared, surface.range_squared)
 
     dtype = T_world_lidar.wxyz_xyz.dtype
     rows = jnp.concatenate([across_first.columns, across_second.columns, surface.columns], 1)

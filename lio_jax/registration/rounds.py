@@ -28,6 +28,7 @@ from lio_jax.registration.lines_and_planes import (
     FeaturePoints,
     Frames,
     LinesAndPlanes,
+    Weights,
     huber,
     linearise,
     no_lines_and_planes,
@@ -52,19 +53,23 @@ class Task(eqx.Module):
     def associate(self, points: FeaturePoints, T_target_lidar: jaxlie.SE3) -> LinesAndPlanes:
         """Return the line or plane of each point at a pose."""
 
+    def weights(self) -> Weights:
+        """Return the robust weights of distances: Huber's."""
+        return huber(self.params.registration.kernel)
+
     def linearised(self, T_target_lidar: jaxlie.SE3, matches: LinesAndPlanes) -> NormalEquations:
         """Return the normal equations at a pose."""
-        points, params = self.points_at(T_target_lidar), self.params
-        weight = huber(params.registration.kernel)
-        return linearise(matches, points, T_target_lidar, self.frames(), weight, params.lidar.range_sigma)
+        points, range_sigma = self.points_at(T_target_lidar), self.params.lidar.range_sigma
+        return linearise(matches, points, T_target_lidar, self.frames(), self.weights(), range_sigma)
 
 
 def match_in_rounds(task: Task, rounds: int | Int32[Array, ""], max_iterations: int) -> Registration:
-    """Find the pose at which the points fit their lines and planes best, by Huber's measure.
+    """Find the pose at which the points fit their lines and planes best, by the task's robust measure.
 
     Directions the matches do not constrain keep the prediction (Zhang & Singh, "On degeneracy of
     optimization-based state estimation problems", ICRA 2016). Matches are kept in a later round if the
-    points have moved less than ``params.registration.reassociation_distance`` since.
+    points have moved less than ``params.registration.reassociation_distance`` since; a round whose first step
+    ends the iteration is the last.
 
     Derivatives are those of the converged pose with the last matches and the held directions fixed
     (:mod:`lio_jax.core.implicit`); where the status is ITERATION_LIMIT they are not to be trusted.
@@ -106,8 +111,8 @@ class _End(eqx.Module):
 def _solve(max_iterations: int, rounds: Int32[Array, ""], task: Task) -> Solution:
     settings = task.params.registration
 
-    def one_round(_: Array, carry: tuple[_End, NormalEquations]) -> tuple[_End, NormalEquations]:
-        end, equations = carry
+    def one_round(carry: tuple) -> tuple:
+        count, _, end, equations = carry
         T = end.T_target_lidar
         points = task.points_at(T)
         association = associated(
@@ -131,13 +136,18 @@ def _solve(max_iterations: int, rounds: Int32[Array, ""], task: Task) -> Solutio
 
         start = (jnp.int32(0), T, jnp.array(False), end.directions, equations)
         number, T, done, directions, equations = jax.lax.while_loop(unfinished, iterate, start)
-        return _End(T, end.iterations + number, done, association, directions), equations
+        end = _End(T, end.iterations + number, done, association, directions)
+        return count + 1, done & (number == 1), end, equations
 
     prediction = task.T_predicted
     dtype = prediction.wxyz_xyz.dtype
     nothing = no_association(no_lines_and_planes(task.points_at(prediction)), prediction)
     start = _End(prediction, jnp.int32(0), jnp.array(False), nothing, Directions.none(dtype))
-    end, equations = jax.lax.fori_loop(0, rounds, one_round, (start, NormalEquations.nothing(dtype)))
+    _, _, end, equations = jax.lax.while_loop(
+        lambda carry: (carry[0] < rounds) & ~carry[1],
+        one_round,
+        (jnp.int32(0), jnp.array(False), start, NormalEquations.nothing(dtype)),
+    )
     return Solution(jnp.zeros(6, dtype), end, equations)
 
 

@@ -9,7 +9,8 @@ import pytest
 
 from lio_jax.core.settings import recipe_settings, with_overrides
 from lio_jax.mapping.point_map import EDGE
-from lio_jax.registration.cube_map import added_to, empty_cube_map, frames_at, matched_cubes
+from lio_jax.registration.cube_map import added_to, matched_cubes
+from lio_jax.registration.feature_map import empty_feature_map, frames_at
 from lio_jax.registration.lines_and_planes import FeaturePoints
 from tests.mapping.test_point_map import held
 
@@ -73,7 +74,7 @@ def added(cubes, points: np.ndarray, position: np.ndarray):
 def test_the_grid_shifts_and_forgets_as_loams_does():
     """Along a way of 1.5 km with a climb; points one per 8 m, so that no two share a voxel."""
     rng = np.random.default_rng(1)
-    cubes, grid, homeless = empty_cube_map(16384), Grid(), np.zeros(2, int)
+    cubes, grid, homeless = empty_feature_map(16384), Grid(), np.zeros(2, int)
     way = np.stack([np.linspace(0, 1500, 40), np.linspace(0, -900, 40), np.linspace(0, 240, 40)], 1)
     for position in way:
         points = np.unique(np.round((position + rng.uniform(-90, 90, (60, 3))) / 8), axis=0) * 8 + 0.13
@@ -100,7 +101,7 @@ def test_nothing_is_added_where_the_scan_was_lost():
     frames = frames_at(jnp.zeros(3), PARAMS)
     mask = jnp.ones(60, bool)
     placed = FeaturePoints(jnp.asarray(points, jnp.float32), mask, jnp.asarray(points, jnp.float32), mask)
-    cubes, corner, surface = _add(empty_cube_map(1024), placed, jnp.array(False), frames)
+    cubes, corner, surface = _add(empty_feature_map(1024), placed, jnp.array(False), frames)
     assert not corner.added.any()
     assert not surface.added.any()
     assert len(held(cubes.corner, CORNER)) == len(held(cubes.surface, SURFACE)) == 0
