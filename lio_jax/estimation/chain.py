@@ -36,6 +36,12 @@ class Chain(eqx.Module):
         """Return which rows are no padding."""
         return jnp.arange(self.imu.duration.shape[0]) < self.count
 
+    def map_rows(self, change: Callable[..., Array], *others: "Chain") -> "Chain":
+        """Return the chain with all arrays of n rows changed; ``others`` are further arguments."""
+        fields = lambda chain: (chain.imu, chain.lidar, chain.relative, chain.gps)  # noqa: E731
+        rows = jax.tree.map(change, fields(self), *map(fields, others))
+        return Chain(self.count, self.gravity, self.prior, *rows)
+
 
 class Weights(NamedTuple):
     """What the robust kernel lets through of each measurement, 0 to 1; 0 where there is none."""

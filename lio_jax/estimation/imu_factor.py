@@ -2,14 +2,16 @@
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 from jaxtyping import Array, Float
 
 from lio_jax.core.error_state import POSITION, ROTATION, VELOCITY
 from lio_jax.core.rotation import rotation_matrix, skew
+from lio_jax.core.types import NavState
 from lio_jax.estimation.motion_state import MotionState
 from lio_jax.estimation.pose_logarithm import inverse_right_jacobian
 from lio_jax.estimation.quadratic import Quadratic, quadratic
-from lio_jax.imu.preintegration import Preintegrated, correct_bias
+from lio_jax.imu.preintegration import Preintegrated, correct_bias, predict
 from lio_jax.imu.rotation_integrals import rotation_integrals
 
 FLOOR = (1e-6,) * 9 + (1e-8,) * 3 + (1e-7,) * 3
@@ -27,6 +29,21 @@ def imu_information(covariance: Float[Array, "15 15"]) -> tuple[Float[Array, "15
     identity = jnp.eye(len(scale), dtype=dtype)
     root = jax.scipy.linalg.solve_triangular(lower, identity, lower=True) * scale
     return root.T @ root, 2 * jnp.sum(jnp.log(jnp.diagonal(root)))
+
+
+def predicted(measured: Preintegrated, gravity: Float[Array, "3"], start: MotionState) -> MotionState:
+    """Return the end of a motion from its start; the biases stay."""
+    still = jaxlie.SE3(jnp.array([1, 0, 0, 0, 0, 0, 0], gravity.dtype))
+    nav = NavState(
+        T_world_imu=start.T_world_imu,
+        velocity=start.velocity,
+        gyro_bias=start.gyro_bias,
+        accel_bias=start.accel_bias,
+        gravity=gravity,
+        T_imu_lidar=still,
+        time_offset=jnp.zeros((), gravity.dtype),
+    )
+    return MotionState.of(predict(measured, nav))
 
 
 def imu_quadratic(

@@ -35,8 +35,9 @@ class Smoothed(eqx.Module):
     status: Int32[Array, ""]
     """CONVERGED, ITERATION_LIMIT or NOT_FINITE; after the last the states are the last good ones."""
     iterations: Int32[Array, ""]
+    """Linearisations."""
     decrement: Float[Array, ""]
-    """Length of the last step, sigmas: sqrt(step' H step)."""
+    """How far the minimum is, sigmas: sqrt(step' H step) of the step that was not taken any more."""
     unmeasured: Int32[Array, ""]
     """Links without inertial samples."""
 
@@ -46,8 +47,11 @@ class Smoothed(eqx.Module):
 
 
 class _Loop(NamedTuple):
+    trial: MotionState
     states: MotionState
+    """The best so far."""
     normal: Normal
+    """At ``states``."""
     damping: Float[Array, ""]
     decrement: Float[Array, ""]
     iterations: Int32[Array, ""]
@@ -70,9 +74,8 @@ def smooth(
     Args:
         chain: n rows, at least two; padding behind ``chain.count`` states.
         guess: n rows: the first iterate.
-        max_iterations: bound of the loop, at least 1; a step that doesn't pay counts too.
-        tolerance: converged when a step is shorter than this, sigmas; it is taken, and the next one would
-            be shorter by about as much again.
+        max_iterations: linearisations at most, at least 1; one where the cost is no lower counts too.
+        tolerance: converged when the next step would be shorter than this, sigmas.
     """
     problem = Problem(_solve, _no_probe, _gradient, _report, inverse_slope=_inverse_hessian)
     found = implicit(problem, (chain, guess, tolerance, max_iterations))
@@ -95,39 +98,43 @@ def _solve(inputs: Any) -> Solution:
     chain, guess, tolerance, max_iterations = inputs
     information = information_of(chain)
 
+    @jax.jit
+    def normal_at(states: MotionState) -> Normal:
+        return linearise(chain, information, states)
+
     def iterate(loop: _Loop) -> _Loop:
-        matrix, gradient = loop.normal.matrix, loop.normal.gradient
-        step = -solve(factorise(_damped(matrix, loop.damping)), gradient)
-        trial = loop.states.retract(step)
-        normal = linearise(chain, information, trial)
+        normal = normal_at(loop.trial)
         # at the minimum rounding decides whether the cost falls
-        rounding = 1e3 * jnp.finfo(gradient.dtype).eps * (1 + jnp.abs(loop.normal.cost))
+        rounding = 1e3 * jnp.finfo(normal.cost.dtype).eps * (1 + jnp.abs(normal.cost))
         pays = normal.cost <= loop.normal.cost + rounding
-        decrement = jnp.sqrt(jnp.abs(jnp.sum(step * gradient)))
         less = jnp.where(loop.damping > _LEAST_DAMPING, loop.damping / _WORTH, 0.0)
-        more = jnp.maximum(loop.damping * _WORTH, _FIRST_DAMPING)
+        damping = jnp.where(pays, less, jnp.maximum(loop.damping * _WORTH, _FIRST_DAMPING))
         states, normal = jax.tree.map(
-            lambda new, old: jnp.where(pays, new, old), (trial, normal), (loop.states, loop.normal)
+            lambda new, old: jnp.where(pays, new, old), (loop.trial, normal), (loop.states, loop.normal)
         )
+        step = -solve(factorise(_damped(normal.matrix, damping)), normal.gradient)
+        decrement = jnp.sqrt(jnp.abs(jnp.sum(step * normal.gradient)))
         return _Loop(
+            trial=states.retract(step),
             states=states,
             normal=normal,
-            damping=jnp.where(pays, less, more),
+            damping=damping,
             decrement=decrement,
             iterations=loop.iterations + 1,
-            done=pays & (decrement <= tolerance) & (loop.damping < 1),
+            done=(damping == 0) & (decrement <= tolerance),
         )
 
     def unfinished(loop: _Loop) -> Array:
         return ~loop.done & (loop.iterations < max_iterations) & (loop.damping < _MOST_DAMPING)
 
-    first = linearise(chain, information, guess)
-    dtype = first.gradient.dtype
-    start = _Loop(guess, first, jnp.zeros((), dtype), jnp.zeros((), dtype), jnp.int32(0), jnp.array(False))
+    blank = jax.tree.map(
+        lambda leaf: jnp.full(leaf.shape, jnp.inf, leaf.dtype), jax.eval_shape(normal_at, guess)
+    )
+    zero = jnp.zeros((), blank.cost.dtype)
+    start = _Loop(guess, guess, blank, zero, zero, jnp.int32(0), jnp.array(False))
     loop = jax.lax.while_loop(unfinished, iterate, start)
-    root = jnp.zeros(first.gradient.size, dtype)
-    kept = loop._replace(normal=None)
-    return Solution(root, kept, (loop.states, loop.normal))
+    root = jnp.zeros(blank.gradient.size, blank.gradient.dtype)
+    return Solution(root, loop._replace(normal=None, trial=None), (loop.states, loop.normal))
 
 
 def _damped(matrix: BlockTridiagonal, damping: Array) -> BlockTridiagonal:

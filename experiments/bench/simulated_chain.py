@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import jaxlie
 
 from lio_jax.core.params import ImuParams
-from lio_jax.core.types import NavState
 from lio_jax.estimation.chain import Chain
+from lio_jax.estimation.imu_factor import predicted
 from lio_jax.estimation.marginal_prior import gaussian_prior
 from lio_jax.estimation.motion_state import MotionState
 from lio_jax.estimation.pose_factors import PoseMeasurement, PositionMeasurement, RelativePose
 from lio_jax.imu.noise_shares import NoiseShares, noise_shares
-from lio_jax.imu.preintegration import Preintegrated, predict, preintegrate_parallel
+from lio_jax.imu.preintegration import Preintegrated, preintegrate_parallel
 from lio_jax.imu.sampling import Intervals
 
 STEP = 1 / 200
@@ -47,19 +47,6 @@ class Recording(eqx.Module):
     shares: NoiseShares
 
 
-def nav_of(state: MotionState) -> NavState:
-    still = jaxlie.SE3(jnp.array([1.0, 0, 0, 0, 0, 0, 0]))
-    return NavState(
-        state.T_world_imu,
-        state.velocity,
-        state.gyro_bias,
-        state.accel_bias,
-        GRAVITY,
-        still,
-        jnp.zeros(()),
-    )
-
-
 def rows(tree, which):
     return jax.tree.map(lambda leaf: leaf[which], tree)
 
@@ -68,11 +55,27 @@ def along(first: MotionState, links: Preintegrated) -> MotionState:
     """Return the states that a chain of links leads through."""
 
     def follow(state, link):
-        state = MotionState.of(predict(link, nav_of(state)))
-        return state, state
+        return (predicted(link, GRAVITY, state),) * 2
 
     rest = jax.lax.scan(follow, first, links)[1]
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
+
+
+def once_more(tree):
+    """Repeat the last row: links have one row more than there are."""
+    return jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf[-1:]]), tree)
+
+
+def links_of(intervals, gyro_bias, accel_bias, params: ImuParams) -> Preintegrated:
+    single = lambda i, g, a: preintegrate_parallel(i, g, a, params)  # noqa: E731
+    return jax.vmap(single)(intervals, gyro_bias, accel_bias)
+
+
+@jax.jit
+def preintegrated_anew(recording: Recording, states: MotionState, params: ImuParams = IMU) -> Recording:
+    """Return the recording with its samples preintegrated with the states' biases instead of zero."""
+    links = links_of(recording.intervals, states.gyro_bias[:-1], states.accel_bias[:-1], params)
+    return eqx.tree_at(lambda r: r.chain.imu, recording, once_more(links))
 
 
 @partial(jax.jit, static_argnames=("count", "extras"))
@@ -102,11 +105,8 @@ def simulate(seed, count: int, params: ImuParams = IMU, extras: bool = False) ->
             duration, gyro.reshape(shape), accel.reshape(shape), 0 * duration, known, jnp.ones(links, bool)
         )
 
-    def links_of(intervals, gyro_bias, accel_bias):
-        return jax.vmap(lambda i, g, a: preintegrate_parallel(i, g, a, params))(intervals, gyro_bias, accel_bias)
-
     zero = jnp.zeros((links, 3))
-    truth = along(first, links_of(intervals_of(rate, force), zero, zero))
+    truth = along(first, links_of(intervals_of(rate, force), zero, zero, params))
     walk = jnp.concatenate([params.gyro_bias_walk * jnp.ones(3), params.accel_bias_walk * jnp.ones(3)])
     steps = walk * STEP**0.5 * jax.random.normal(next(keys), (len(time), 6))
     start_error = PRIOR_SIGMA * jax.random.normal(next(keys), (15,))
@@ -121,9 +121,8 @@ def simulate(seed, count: int, params: ImuParams = IMU, extras: bool = False) ->
     mean = dataclasses.replace(mean, gyro_bias=jnp.zeros(3), accel_bias=jnp.zeros(3))
 
     intervals = intervals_of(samples[:, :3], samples[:, 3:])
-    imu = links_of(intervals, zero, zero)
+    imu = links_of(intervals, zero, zero, params)
     shares = jax.vmap(noise_shares)(intervals, zero, zero)
-    once_more = partial(jax.tree.map, lambda leaf: jnp.concatenate([leaf, leaf[-1:]]))
 
     def noisy(pose, key, sigma):
         error = sigma * jax.random.normal(key, (len(pose.wxyz_xyz), 6))
