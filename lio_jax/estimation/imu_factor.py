@@ -9,10 +9,9 @@ from lio_jax.core.error_state import POSITION, ROTATION, VELOCITY
 from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.core.types import NavState
 from lio_jax.estimation.motion_state import MotionState
-from lio_jax.estimation.pose_logarithm import inverse_right_jacobian
+from lio_jax.estimation.pose_logarithm import right_jacobian
 from lio_jax.estimation.quadratic import Quadratic, quadratic
-from lio_jax.imu.preintegration import Preintegrated, correct_bias, predict
-from lio_jax.imu.rotation_integrals import rotation_integrals
+from lio_jax.imu.preintegration import Preintegrated, predict
 
 FLOOR = (1e-6,) * 9 + (1e-8,) * 3 + (1e-7,) * 3
 """Sigmas added to the preintegrated covariance, rad, m, m/s, rad/s, m/s^2: between two states of one instant,
@@ -73,49 +72,44 @@ def imu_residual(
         start: state at the first instant.
         end: state at the last one.
     """
-    gained = correct_bias(measured, start.gyro_bias, start.accel_bias)
-    elapsed, fall = gained.duration, jnp.where(gained.measured, gravity, 0.0)
-    first, last = start.T_world_imu, end.T_world_imu
-    R_end_start = rotation_matrix(last.rotation().inverse() @ first.rotation())
-    to_end = rotation_matrix(last.rotation()).T
-    way = first.translation() + elapsed * (start.velocity + elapsed / 2 * fall) - last.translation()
-    missed = last.rotation().inverse() @ first.rotation() @ gained.rotation
-    turn = missed.log()
-    residual = jnp.concatenate(
-        [
-            turn,
-            to_end @ way + R_end_start @ gained.position,
-            to_end @ (start.velocity + elapsed * fall - end.velocity) + R_end_start @ gained.velocity,
-            start.gyro_bias - end.gyro_bias,
-            start.accel_bias - end.accel_bias,
-        ]
-    )
-    change = jnp.concatenate([start.gyro_bias - measured.gyro_bias, start.accel_bias - measured.accel_bias])
+    biases = jnp.concatenate([start.gyro_bias, start.accel_bias])
     by_bias = measured.bias_jacobian
-    R_end_before = R_end_start @ rotation_matrix(measured.rotation)
-    right = inverse_right_jacobian(turn)
-    # Exp(c + dc) = Exp(c) Exp(J dc) with the right Jacobian J at c
-    bias_turn = rotation_integrals(-by_bias[ROTATION] @ change)[0] @ by_bias[ROTATION]
-    zero, identity = jnp.zeros_like(right), jnp.eye(3, dtype=right.dtype)
-    by_start = jnp.block(
+    gained = by_bias @ (biases - jnp.concatenate([measured.gyro_bias, measured.accel_bias]))
+    elapsed, fall = measured.duration, jnp.where(measured.measured, gravity, 0.0)
+    first, last = start.T_world_imu, end.T_world_imu
+    back = last.rotation().inverse()
+    turned = measured.rotation @ jaxlie.SO3.exp(gained[ROTATION])
+    turn = (back @ first.rotation() @ turned).log()
+    quaternions = jnp.stack([first.rotation().wxyz, back.wxyz, measured.rotation.wxyz, turned.wxyz])
+    R_world_start, R_end_world, R_start_before, R_start_predicted = rotation_matrix(jaxlie.SO3(quaternions))
+    R_end_start = R_end_world @ R_world_start
+    R_end_before = R_end_start @ R_start_before
+    (bias_turn, _), (_, right) = zip(*right_jacobian(jnp.stack([gained[ROTATION], turn])), strict=True)
+
+    # position and velocity side by side
+    way = first.translation() + elapsed * (start.velocity + elapsed / 2 * fall) - last.translation()
+    speed = start.velocity + elapsed * fall - end.velocity
+    increments = jnp.stack([measured.position, measured.velocity])
+    increments += jnp.stack([gained[POSITION], gained[VELOCITY]]) @ R_start_before.T
+    missed = jnp.stack([way, speed]) @ R_end_world.T + increments @ R_end_start.T
+    drift = biases - jnp.concatenate([end.gyro_bias, end.accel_bias])
+    residual = jnp.concatenate([turn, missed.ravel(), drift])
+
+    dtype = residual.dtype
+    by_gained = jnp.stack([right @ bias_turn, R_end_before, R_end_before])
+    by_start_turn = jnp.stack([right @ R_start_predicted.T, *(-R_end_start @ skew(increments))])
+    by_end_turn = jnp.stack([-right.T, *skew(missed)])
+    # position by position and velocity, velocity by velocity
+    shares = jnp.stack([jnp.ones_like(elapsed), elapsed, jnp.zeros_like(elapsed), jnp.ones_like(elapsed)])
+    by_start = shares.reshape(2, 1, 2, 1) * R_end_start[None, :, None]
+    motion = jnp.concatenate(
         [
-            [right @ rotation_matrix(gained.rotation).T, zero, zero, right @ bias_turn],
-            [
-                -R_end_start @ skew(gained.position),
-                R_end_start,
-                elapsed * R_end_start,
-                R_end_before @ by_bias[POSITION],
-            ],
-            [-R_end_start @ skew(gained.velocity), zero, R_end_start, R_end_before @ by_bias[VELOCITY]],
-        ]
+            by_start_turn.reshape(9, 3),
+            jnp.concatenate([jnp.zeros((3, 6), dtype), by_start.reshape(6, 6)]),
+            (by_gained @ by_bias.reshape(3, 3, 6)).reshape(9, 6),
+            by_end_turn.reshape(9, 3),
+            -jnp.eye(9, 12, -3, dtype=dtype),
+        ],
+        axis=1,
     )
-    by_end = jnp.block(
-        [
-            [-right.T, zero, zero, zero, zero],
-            [skew(residual[POSITION]), -identity, zero, zero, zero],
-            [skew(residual[VELOCITY]), zero, -identity, zero, zero],
-        ]
-    )
-    six = jnp.eye(6, dtype=right.dtype)
-    biases = jnp.concatenate([jnp.zeros((6, 9), six.dtype), six], axis=1)
-    return residual, jnp.block([[by_start, by_end], [biases, -biases]])
+    return residual, jnp.concatenate([motion, jnp.eye(6, 30, 9, dtype=dtype) - jnp.eye(6, 30, 24, dtype=dtype)])

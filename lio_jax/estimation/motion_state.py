@@ -9,7 +9,7 @@ from lio_jax.core.blocks import from_blocks
 from lio_jax.core.error_state import ACCEL_BIAS, BIASES, GYRO_BIAS, POSITION, ROTATION, VELOCITY
 from lio_jax.core.rotation import rotation_matrix
 from lio_jax.core.types import NavState
-from lio_jax.estimation.pose_logarithm import inverse_right_jacobian
+from lio_jax.estimation.pose_logarithm import right_jacobian
 
 DOF = 15
 """The first components of :mod:`lio_jax.core.error_state`, in that order and perturbed as there."""
@@ -67,7 +67,7 @@ def local_jacobian(origin: MotionState, state: MotionState) -> Float[Array, "15 
     matrix = rotation_matrix(turn)
     return from_blocks(
         (DOF, DOF),
-        (ROTATION, ROTATION, inverse_right_jacobian(turn.log())),
+        (ROTATION, ROTATION, right_jacobian(turn.log())[1]),
         (POSITION, POSITION, matrix),
         (VELOCITY, VELOCITY, matrix),
         (BIASES, BIASES, jnp.eye(6, dtype=matrix.dtype)),

@@ -11,32 +11,44 @@ from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.imu.rotation_integrals import rotation_coefficients
 
 
-def inverse_right_jacobian(rotvec: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Return the derivative of log(R Exp(d)) at d = 0, where ``rotvec`` = log(R), rad."""
+def right_jacobian(rotvec: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3 3"], Float[Array, "*b 3 3"]]:
+    """Return J with Exp(w + dw) = Exp(w) Exp(J dw) at a rotation vector w, rad, and its inverse.
+
+    The inverse is the derivative of log(R Exp(d)) at d = 0.
+    """
     cross = skew(rotvec)
-    kappa, _ = _kappa(jnp.sum(rotvec**2))
-    return jnp.eye(3, dtype=rotvec.dtype) + cross / 2 + kappa * (cross @ cross)
+    square = cross @ cross
+    b, c, kappa, _ = _coefficients(rotvec)
+    identity = jnp.eye(3, dtype=rotvec.dtype)
+    return identity - b * cross + c * square, identity + cross / 2 + kappa * square
 
 
-def log_and_jacobian(pose: jaxlie.SE3) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
+def log_and_jacobian(pose: jaxlie.SE3) -> tuple[Float[Array, "*b 6"], Float[Array, "*b 6 6"]]:
     """Return log(T), and the derivative of log(T exp(d)) at d = 0.
 
     The translation's part is the inverse left Jacobian J(w)^-1 = I - W/2 + k W^2 times t, with W the cross
     product with the rotation vector w, so its derivative follows from that of k by the angle's square.
     """
-    turn = pose.rotation().log()
-    along = pose.translation()
-    square = jnp.sum(turn**2)
-    kappa, slope = _kappa(square)
-    once = jnp.cross(turn, along)
-    twice = jnp.cross(turn, once)
-    move = along - once / 2 + kappa * twice
-    by_twice = jnp.dot(turn, along) * jnp.eye(3, dtype=turn.dtype)
-    by_twice += jnp.outer(turn, along) - 2 * jnp.outer(along, turn)
-    move_by_turn = skew(along) / 2 + kappa * by_twice + 2 * slope * jnp.outer(twice, turn)
-    right = inverse_right_jacobian(turn)
-    jacobian = jnp.block([[right, jnp.zeros_like(right)], [move_by_turn @ right, right]])
-    return jnp.concatenate([turn, move]), jacobian
+    turn, along = pose.rotation().log(), pose.translation()
+    turning, moving = jnp.moveaxis(skew(jnp.stack([turn, along], axis=-2)), -3, 0)
+    *_, kappa, slope = _coefficients(turn)
+    square = turning @ turning
+    identity = jnp.eye(3, dtype=turn.dtype)
+    right = identity + turning / 2 + kappa * square
+    left_inverse = jnp.swapaxes(right, -1, -2)
+    column, row = along[..., :, None], turn[..., None, :]
+    of_square = jnp.sum(turn * along, -1)[..., None, None] * identity
+    of_square += turn[..., :, None] * along[..., None, :] - 2 * column * row
+    by_turn = moving / 2 + kappa * of_square + 2 * slope * (square @ column) * row
+    zero = jnp.zeros_like(right)
+    jacobian = jnp.concatenate(
+        [
+            jnp.concatenate([right, zero], axis=-1),
+            jnp.concatenate([by_turn @ right, right], axis=-1),
+        ],
+        axis=-2,
+    )
+    return jnp.concatenate([turn, (left_inverse @ column)[..., 0]], axis=-1), jacobian
 
 
 def adjoint(pose: jaxlie.SE3) -> Float[Array, "6 6"]:
@@ -45,9 +57,10 @@ def adjoint(pose: jaxlie.SE3) -> Float[Array, "6 6"]:
     return jnp.block([[matrix, jnp.zeros_like(matrix)], [skew(pose.translation()) @ matrix, matrix]])
 
 
-def _kappa(square: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return (1 - t cot(t/2) / 2) / t^2 and its derivative by t^2, of an angle's square."""
-    _, b, c, d, e, f = jnp.moveaxis(rotation_coefficients(square), -1, 0)
+def _coefficients(rotvec: Float[Array, "*b 3"]) -> list[Float[Array, "*b 1 1"]]:
+    """Return (1 - cos t) / t^2, (t - sin t) / t^3, k = (1 - t cot(t/2) / 2) / t^2 and dk / dt^2."""
+    values = rotation_coefficients(jnp.sum(rotvec**2, -1))[..., None, None]
+    _, b, c, d, e, f = (values[..., n, :, :] for n in range(6))
     kappa = (c - 2 * d) / (2 * b)
     slope = ((3 * e - d) / 2 - (4 * f - e) - kappa * (2 * d - c)) / (2 * b)
-    return kappa, slope
+    return [b, c, kappa, slope]
