@@ -42,6 +42,10 @@ class Problem(eqx.Module):
     directions: Callable[[Array, Any], tuple[Array, Array]] | None = None
     """``(root, inputs) -> B (d, k), C (k, d)``: the probe feels a step dx of the root as it would B C dx, so
     that k of its derivatives will do. None: the identity."""
+    inverse_slope: Callable[[Array, Any, Any, Array], Array] | None = None
+    """``(root, selection, inputs, right) -> (dr/dx)^-1 right`` for a symmetric dr/dx whose structure makes this
+    cheaper than a dense factorisation, such as that of a chain. It is taken as constant: this derivative has
+    none of its own."""
 
 
 def implicit(problem: Problem, inputs: Any) -> Solution:
@@ -74,13 +78,11 @@ def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
     smooth, probed_push, rest = jax.jvp(
         lambda moving: probe(root, moving), (moving,), (inputs_dot,), has_aux=True
     )
-    forth = back = jnp.eye(len(root), dtype=root.dtype)
-    if problem.directions is not None:
-        forth, back = problem.directions(root, inputs)
-    along = jax.vmap(lambda step: jax.jvp(lambda root: probe(root, moving)[0], (root,), (step,))[1])(forth.T)
 
-    def felt(step: Array) -> Any:
-        return jax.tree.map(lambda slope: jnp.tensordot((back @ step).astype(slope.dtype), slope, 1), along)
+    def probed_along(step: Array) -> Any:
+        return jax.jvp(lambda root: probe(root, moving)[0], (root,), (step,))[1]
+
+    felt = probed_along if problem.inverse_slope else _felt(problem, root, inputs, probed_along)
 
     def known_of(smooth: Any) -> tuple[Any, Any]:
         return eqx.combine(smooth, rest), solution.selection
@@ -95,14 +97,34 @@ def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
         by_root = lambda root, smooth: residual(root, smooth, moving)  # noqa: E731
         return jax.jvp(by_root, (root, smooth), (step, felt(step)))[1]
 
-    slope = jax.vmap(slope_along, out_axes=1)(jnp.eye(len(root), dtype=root.dtype))
     _, push = jax.jvp(
         lambda smooth, moving: residual(root, smooth, moving), (smooth, moving), (probed_push, inputs_dot)
     )
-    root_dot = -jnp.linalg.solve(slope, push)
+    if problem.inverse_slope:
+        held = jax.lax.stop_gradient((root, solution.selection, inputs))
+        invert = problem.inverse_slope
+        root_dot = -jax.lax.custom_linear_solve(
+            slope_along, push, lambda _, right: invert(*held, right), symmetric=True
+        )
+    else:
+        slope = jax.vmap(slope_along, out_axes=1)(jnp.eye(len(root), dtype=root.dtype))
+        root_dot = -jnp.linalg.solve(slope, push)
     probed_dot = jax.tree.map(jnp.add, probed_push, felt(root_dot))
     _, reported_dot = jax.jvp(report, (root, smooth, moving), (root_dot, probed_dot, inputs_dot))
     return solution, Solution(root_dot, _still(solution.selection), _tangent(reported_dot))
+
+
+def _felt(problem: Problem, root: Array, inputs: Any, probed_along: Callable[[Array], Any]) -> Callable:
+    """Return ``probed_along`` as a product with its derivatives in the few directions that it feels."""
+    forth = back = jnp.eye(len(root), dtype=root.dtype)
+    if problem.directions is not None:
+        forth, back = problem.directions(root, inputs)
+    along = jax.vmap(probed_along)(forth.T)
+
+    def felt(step: Array) -> Any:
+        return jax.tree.map(lambda slope: jnp.tensordot((back @ step).astype(slope.dtype), slope, 1), along)
+
+    return felt
 
 
 def known(value: _Value, function: Callable[..., _Value], *inputs: Any) -> _Value:

@@ -1,0 +1,163 @@
+"""A chain of states with all that was measured along it, and its normal equations."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int32
+
+from lio_jax.core.block_tridiagonal import BlockTridiagonal
+from lio_jax.estimation.imu_factor import imu_information, imu_quadratic
+from lio_jax.estimation.marginal_prior import Prior
+from lio_jax.estimation.motion_state import DOF, POSE_DOF, MotionState
+from lio_jax.estimation.pose_factors import PoseMeasurement, PositionMeasurement, RelativePose
+from lio_jax.estimation.quadratic import Quadratic
+from lio_jax.imu.preintegration import Preintegrated
+
+
+class Chain(eqx.Module):
+    """Measurements in arrays of n rows, one a state; those between two states stand in the row of the first."""
+
+    count: Int32[Array, ""]
+    """States there are: those behind are padding, and so are the rows that lead to them."""
+    gravity: Float[Array, "3"]
+    """In world, m/s^2."""
+    prior: Prior
+    """Of the first state."""
+    imu: Preintegrated
+    """To the next state; the last row leads nowhere. Without samples (``measured``) its covariance is wide."""
+    lidar: PoseMeasurement
+    relative: RelativePose | None = None
+    gps: PositionMeasurement | None = None
+
+    def present(self) -> Bool[Array, " n"]:
+        """Return which rows are no padding."""
+        return jnp.arange(self.imu.duration.shape[0]) < self.count
+
+    def map_rows(self, change: Callable[..., Array], *others: "Chain") -> "Chain":
+        """Return the chain with all arrays of n rows changed; ``others`` are further arguments."""
+        fields = lambda chain: (chain.imu, chain.lidar, chain.relative, chain.gps)  # noqa: E731
+        rows = jax.tree.map(change, fields(self), *map(fields, others))
+        return Chain(self.count, self.gravity, self.prior, *rows)
+
+
+class Weights(NamedTuple):
+    """What the robust kernel lets through of each measurement, 0 to 1; 0 where there is none."""
+
+    lidar: Float[Array, " n"]
+    relative: Float[Array, " m"] | None
+    """Between neighbours, m = n - 1."""
+    gps: Float[Array, " n"] | None
+
+
+class Normal(eqx.Module):
+    """The cost of a chain's states to second order in their errors."""
+
+    matrix: BlockTridiagonal
+    """Gauss-Newton's; the identity where there is no state."""
+    gradient: Float[Array, "n 15"]
+    cost: Float[Array, ""]
+    """Negative log-density but for a constant."""
+    weights: Weights
+
+
+def information_of(chain: Chain) -> Float[Array, "m 15 15"]:
+    """Return the information of each link: once per solve, because it doesn't depend on the states."""
+    return jax.vmap(imu_information)(chain.imu.covariance[:-1])[0]
+
+
+def linearise(
+    chain: Chain, information: Float[Array, "m 15 15"], states: MotionState, exact: bool = False
+) -> Normal:
+    """Return the normal equations of a chain.
+
+    Args:
+        chain: n rows, at least two.
+        information: of its links, from :func:`information_of`.
+        states: n rows, where to linearise.
+        exact: with the second derivatives of the residuals, as the derivative of a solution needs them. The
+            matrix is then that of the gradient's derivative, which is symmetric where the gradient vanishes.
+    """
+    present = chain.present()
+    start = jax.tree.map(lambda rows: rows[:-1], states)
+    end = jax.tree.map(lambda rows: rows[1:], states)
+
+    def over(quadratic: Callable[..., Quadratic], dof: int, there: Array, row: Any, *of: MotionState) -> Quadratic:
+        terms = jax.vmap(_to_second_order(quadratic, dof) if exact else quadratic)(row, *of)
+        return jax.tree.map(lambda leaf: jnp.where(_column(there, leaf), leaf, 0.0), terms)
+
+    first = jax.tree.map(lambda rows: rows[:1], states)
+    gravity = jnp.broadcast_to(chain.gravity, (len(information), 3))
+    prior = over(Prior.quadratic, DOF, present[:1], jax.tree.map(lambda leaf: leaf[None], chain.prior), first)
+    links = over(_link_quadratic, DOF, present[1:], (_leading(chain.imu), gravity, information), start, end)
+    lidar = over(PoseMeasurement.quadratic, POSE_DOF, present, chain.lidar, states)
+    unary = [prior, lidar]
+    binary = [links]
+    relative = gps = None
+    if chain.relative is not None:
+        row = _leading(chain.relative)
+        relative = over(RelativePose.quadratic, POSE_DOF, present[1:], row, start, end)
+        binary.append(relative)
+    if chain.gps is not None:
+        gps = over(PositionMeasurement.quadratic, POSE_DOF, present, chain.gps, states)
+        unary.append(gps)
+    matrix, gradient = _assembled(present, unary, binary)
+    return Normal(
+        matrix=matrix,
+        gradient=gradient,
+        cost=sum((jnp.sum(term.cost) for term in unary + binary), jnp.zeros((), gradient.dtype)),
+        weights=Weights(lidar.weight, relative and relative.weight, gps and gps.weight),
+    )
+
+
+def _assembled(
+    present: Array, unary: list[Quadratic], binary: list[Quadratic]
+) -> tuple[BlockTridiagonal, Array]:
+    """Return the sums of all terms' Hessians and gradients."""
+    dtype = unary[0].gradient.dtype
+    diagonal = jnp.where(present[:, None, None], 0.0, jnp.eye(DOF, dtype=dtype))
+    coupling = jnp.zeros((len(present) - 1, DOF, DOF), dtype)
+    gradient = jnp.zeros((len(present), DOF), dtype)
+    for term in unary:
+        rows, part = slice(len(term.gradient)), slice(term.gradient.shape[1])
+        diagonal = diagonal.at[rows, part, part].add(term.hessian)
+        gradient = gradient.at[rows, part].add(term.gradient)
+    for term in binary:
+        dof = term.gradient.shape[1] // 2
+        part, first, second = slice(dof), slice(dof), slice(dof, None)
+        diagonal = diagonal.at[:-1, part, part].add(term.hessian[:, first, first])
+        diagonal = diagonal.at[1:, part, part].add(term.hessian[:, second, second])
+        coupling = coupling.at[:, part, part].add(term.hessian[:, second, first])
+        gradient = gradient.at[:-1, part].add(term.gradient[:, first])
+        gradient = gradient.at[1:, part].add(term.gradient[:, second])
+    return BlockTridiagonal((diagonal + jnp.swapaxes(diagonal, 1, 2)) / 2, coupling), gradient
+
+
+def _link_quadratic(link: tuple, start: MotionState, end: MotionState) -> Quadratic:
+    return imu_quadratic(*link, start, end)
+
+
+def _to_second_order(quadratic: Callable[..., Quadratic], dof: int) -> Callable[..., Quadratic]:
+    """Return the same cost with the derivative of its gradient in place of Gauss-Newton's Hessian."""
+
+    def curved(row: Any, *states: MotionState) -> Quadratic:
+        def gradient(error: Array) -> Array:
+            parts = error.reshape(len(states), dof)
+            padded = jnp.pad(parts, ((0, 0), (0, DOF - dof)))
+            moved = [state.retract(part) for state, part in zip(states, padded, strict=True)]
+            return quadratic(row, *moved).gradient
+
+        slope = jax.jacfwd(gradient)(jnp.zeros(dof * len(states), states[0].velocity.dtype))
+        return eqx.tree_at(lambda term: term.hessian, quadratic(row, *states), slope)
+
+    return curved
+
+
+def _leading(rows: Any) -> Any:
+    return jax.tree.map(lambda leaf: leaf[:-1], rows)
+
+
+def _column(there: Array, leaf: Array) -> Array:
+    return there.reshape(-1, *(1,) * (leaf.ndim - 1))

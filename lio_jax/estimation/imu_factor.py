@@ -1,0 +1,115 @@
+"""Inertial samples between two states, as a factor between them (Forster et al., T-RO 2017)."""
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from lio_jax.core.error_state import POSITION, ROTATION, VELOCITY
+from lio_jax.core.rotation import rotation_matrix, skew
+from lio_jax.core.types import NavState
+from lio_jax.estimation.motion_state import MotionState
+from lio_jax.estimation.pose_logarithm import right_jacobian
+from lio_jax.estimation.quadratic import Quadratic, quadratic
+from lio_jax.imu.preintegration import Preintegrated, predict
+
+FLOOR = (1e-6,) * 9 + (1e-8,) * 3 + (1e-7,) * 3
+"""Sigmas added to the preintegrated covariance, rad, m, m/s, rad/s, m/s^2: between two states of one instant,
+or one sample apart, it is singular. Small against any sensor's noise, large against float64's rounding."""
+
+
+def imu_information(covariance: Float[Array, "15 15"]) -> tuple[Float[Array, "15 15"], Float[Array, ""]]:
+    """Return the inverse of a preintegrated covariance, and the inverse's log-determinant."""
+    dtype = covariance.dtype
+    floored = covariance + jnp.diag(jnp.asarray(FLOOR, dtype) ** 2)
+    # scaled to unit variances: the units' sizes differ by orders of magnitude
+    scale = 1 / jnp.sqrt(jnp.diagonal(floored))
+    lower = jnp.linalg.cholesky(scale[:, None] * floored * scale)
+    identity = jnp.eye(len(scale), dtype=dtype)
+    root = jax.scipy.linalg.solve_triangular(lower, identity, lower=True) * scale
+    return root.T @ root, 2 * jnp.sum(jnp.log(jnp.diagonal(root)))
+
+
+def predicted(measured: Preintegrated, gravity: Float[Array, "3"], start: MotionState) -> MotionState:
+    """Return the end of a motion from its start; the biases stay."""
+    still = jaxlie.SE3(jnp.array([1, 0, 0, 0, 0, 0, 0], gravity.dtype))
+    nav = NavState(
+        T_world_imu=start.T_world_imu,
+        velocity=start.velocity,
+        gyro_bias=start.gyro_bias,
+        accel_bias=start.accel_bias,
+        gravity=gravity,
+        T_imu_lidar=still,
+        time_offset=jnp.zeros((), gravity.dtype),
+    )
+    return MotionState.of(predict(measured, nav))
+
+
+def imu_quadratic(
+    measured: Preintegrated,
+    gravity: Float[Array, "3"],
+    information: Float[Array, "15 15"],
+    start: MotionState,
+    end: MotionState,
+) -> Quadratic:
+    """Return the cost of the motion from ``start`` to ``end``, over both states' errors."""
+    residual, jacobian = imu_residual(measured, gravity, start, end)
+    return quadratic(residual, jacobian, information, jnp.ones((), residual.dtype))
+
+
+def imu_residual(
+    measured: Preintegrated, gravity: Float[Array, "3"], start: MotionState, end: MotionState
+) -> tuple[Float[Array, "15"], Float[Array, "15 30"]]:
+    """Return the predicted end against ``end``, and how that depends on the errors of both states.
+
+    ``end.local(predicted)`` of rotation, position and velocity, as gtsam's ImuFactor has it, and the biases
+    at the start minus those at the end (Forster et al. 2017, eqs. 45 and 40; their right Jacobians, appendix
+    C, with all residuals in the end's frame). The biases change the increments to first order.
+
+    Args:
+        measured: preintegrated from ``start`` to ``end``. Without samples it says that the velocity stays.
+        gravity: in world, m/s^2.
+        start: state at the first instant.
+        end: state at the last one.
+    """
+    biases = jnp.concatenate([start.gyro_bias, start.accel_bias])
+    by_bias = measured.bias_jacobian
+    gained = by_bias @ (biases - jnp.concatenate([measured.gyro_bias, measured.accel_bias]))
+    elapsed, fall = measured.duration, jnp.where(measured.measured, gravity, 0.0)
+    first, last = start.T_world_imu, end.T_world_imu
+    back = last.rotation().inverse()
+    turned = measured.rotation @ jaxlie.SO3.exp(gained[ROTATION])
+    turn = (back @ first.rotation() @ turned).log()
+    quaternions = jnp.stack([first.rotation().wxyz, back.wxyz, measured.rotation.wxyz, turned.wxyz])
+    R_world_start, R_end_world, R_start_before, R_start_predicted = rotation_matrix(jaxlie.SO3(quaternions))
+    R_end_start = R_end_world @ R_world_start
+    R_end_before = R_end_start @ R_start_before
+    (bias_turn, _), (_, right) = zip(*right_jacobian(jnp.stack([gained[ROTATION], turn])), strict=True)
+
+    # position and velocity side by side
+    way = first.translation() + elapsed * (start.velocity + elapsed / 2 * fall) - last.translation()
+    speed = start.velocity + elapsed * fall - end.velocity
+    increments = jnp.stack([measured.position, measured.velocity])
+    increments += jnp.stack([gained[POSITION], gained[VELOCITY]]) @ R_start_before.T
+    missed = jnp.stack([way, speed]) @ R_end_world.T + increments @ R_end_start.T
+    drift = biases - jnp.concatenate([end.gyro_bias, end.accel_bias])
+    residual = jnp.concatenate([turn, missed.ravel(), drift])
+
+    dtype = residual.dtype
+    by_gained = jnp.stack([right @ bias_turn, R_end_before, R_end_before])
+    by_start_turn = jnp.stack([right @ R_start_predicted.T, *(-R_end_start @ skew(increments))])
+    by_end_turn = jnp.stack([-right.T, *skew(missed)])
+    # position by position and velocity, velocity by velocity
+    shares = jnp.stack([jnp.ones_like(elapsed), elapsed, jnp.zeros_like(elapsed), jnp.ones_like(elapsed)])
+    by_start = shares.reshape(2, 1, 2, 1) * R_end_start[None, :, None]
+    motion = jnp.concatenate(
+        [
+            by_start_turn.reshape(9, 3),
+            jnp.concatenate([jnp.zeros((3, 6), dtype), by_start.reshape(6, 6)]),
+            (by_gained @ by_bias.reshape(3, 3, 6)).reshape(9, 6),
+            by_end_turn.reshape(9, 3),
+            -jnp.eye(9, 12, -3, dtype=dtype),
+        ],
+        axis=1,
+    )
+    return residual, jnp.concatenate([motion, jnp.eye(6, 30, 9, dtype=dtype) - jnp.eye(6, 30, 24, dtype=dtype)])

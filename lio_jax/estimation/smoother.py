@@ -1,0 +1,164 @@
+"""The most probable states of a chain: a window's, or a whole recording's.
+
+Gauss-Newton on all states at once, with a damped step (Levenberg-Marquardt) where a full one would not pay;
+block-tridiagonal Cholesky makes it linear in the number of states (Barfoot, "State estimation for robotics",
+2017, chapter 3). Run it in float64: the information of 0.1 s of inertial samples is 1e10 times a prior's.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int32
+
+from lio_jax.core.block_tridiagonal import BlockTridiagonal, factorise, inverse_blocks, solve
+from lio_jax.core.implicit import Problem, Solution, implicit
+from lio_jax.estimation.chain import Chain, Normal, information_of, linearise
+from lio_jax.estimation.iterated_filter import CONVERGED, ITERATION_LIMIT, NOT_FINITE
+from lio_jax.estimation.motion_state import DOF, MotionState
+
+_FIRST_DAMPING = 1e-4
+_LEAST_DAMPING = 1e-6
+"""Less than this is none."""
+_MOST_DAMPING = 1e8
+_WORTH = 10.0
+"""Factor of the damping when a step pays or doesn't."""
+
+
+class Smoothed(eqx.Module):
+    """The result of a smoother."""
+
+    states: MotionState
+    normal: Normal
+    """At ``states``."""
+    status: Int32[Array, ""]
+    """CONVERGED, ITERATION_LIMIT or NOT_FINITE; after the last the states are the last good ones."""
+    iterations: Int32[Array, ""]
+    """Linearisations."""
+    decrement: Float[Array, ""]
+    """How far the minimum is, sigmas: sqrt(step' H step) of the step that was not taken any more."""
+    unmeasured: Int32[Array, ""]
+    """Links without inertial samples."""
+
+    def covariances(self) -> Float[Array, "n 15 15"]:
+        """Return the marginal covariance of each state's error; the identity for padding."""
+        return inverse_blocks(factorise(self.normal.matrix)).diagonal
+
+
+class _Loop(NamedTuple):
+    trial: MotionState
+    states: MotionState
+    """The best so far."""
+    normal: Normal
+    """At ``states``."""
+    damping: Float[Array, ""]
+    decrement: Float[Array, ""]
+    iterations: Int32[Array, ""]
+    done: Bool[Array, ""]
+
+
+def smooth(
+    chain: Chain,
+    guess: MotionState,
+    *,
+    max_iterations: int,
+    tolerance: Float[Array, ""],
+) -> Smoothed:
+    """Return the states that agree best with all measurements of a chain.
+
+    Derivatives with respect to everything in the chain are those of the converged solution, by the implicit
+    function theorem with the exact second derivatives: don't trust them where ``status`` is not CONVERGED.
+    First order only.
+
+    Args:
+        chain: n rows, at least two; padding behind ``chain.count`` states.
+        guess: n rows: the first iterate.
+        max_iterations: linearisations at most, at least 1; one where the cost is no lower counts too.
+        tolerance: converged when the next step would be shorter than this, sigmas.
+    """
+    problem = Problem(_solve, _no_probe, _gradient, _report, inverse_slope=_inverse_hessian)
+    found = implicit(problem, (chain, guess, tolerance, max_iterations))
+    states, normal = found.reported
+    loop = found.selection
+    finite = jnp.isfinite(normal.cost) & jnp.isfinite(loop.decrement)
+    status = jnp.where(loop.done, CONVERGED, jnp.where(finite, ITERATION_LIMIT, NOT_FINITE))
+    linked = chain.present()[1:]
+    return Smoothed(
+        states=states,
+        normal=normal,
+        status=status.astype(jnp.int32),
+        iterations=loop.iterations,
+        decrement=loop.decrement,
+        unmeasured=jnp.sum(linked & ~chain.imu.measured[:-1]).astype(jnp.int32),
+    )
+
+
+def _solve(inputs: Any) -> Solution:
+    chain, guess, tolerance, max_iterations = inputs
+    information = information_of(chain)
+
+    @jax.jit
+    def normal_at(states: MotionState) -> Normal:
+        return linearise(chain, information, states)
+
+    def iterate(loop: _Loop) -> _Loop:
+        normal = normal_at(loop.trial)
+        # at the minimum rounding decides whether the cost falls
+        rounding = 1e3 * jnp.finfo(normal.cost.dtype).eps * (1 + jnp.abs(normal.cost))
+        pays = normal.cost <= loop.normal.cost + rounding
+        less = jnp.where(loop.damping > _LEAST_DAMPING, loop.damping / _WORTH, 0.0)
+        damping = jnp.where(pays, less, jnp.maximum(loop.damping * _WORTH, _FIRST_DAMPING))
+        states, normal = jax.tree.map(
+            lambda new, old: jnp.where(pays, new, old), (loop.trial, normal), (loop.states, loop.normal)
+        )
+        step = -solve(factorise(_damped(normal.matrix, damping)), normal.gradient)
+        decrement = jnp.sqrt(jnp.abs(jnp.sum(step * normal.gradient)))
+        return _Loop(
+            trial=states.retract(step),
+            states=states,
+            normal=normal,
+            damping=damping,
+            decrement=decrement,
+            iterations=loop.iterations + 1,
+            done=(damping == 0) & (decrement <= tolerance),
+        )
+
+    def unfinished(loop: _Loop) -> Array:
+        return ~loop.done & (loop.iterations < max_iterations) & (loop.damping < _MOST_DAMPING)
+
+    blank = jax.tree.map(
+        lambda leaf: jnp.full(leaf.shape, jnp.inf, leaf.dtype), jax.eval_shape(normal_at, guess)
+    )
+    zero = jnp.zeros((), blank.cost.dtype)
+    start = _Loop(guess, guess, blank, zero, zero, jnp.int32(0), jnp.array(False))
+    loop = jax.lax.while_loop(unfinished, iterate, start)
+    root = jnp.zeros(blank.gradient.size, blank.gradient.dtype)
+    return Solution(root, loop._replace(normal=None, trial=None), (loop.states, loop.normal))
+
+
+def _damped(matrix: BlockTridiagonal, damping: Array) -> BlockTridiagonal:
+    """Return the matrix with its diagonal made larger by a share of itself (Marquardt 1963)."""
+    scale = 1 + damping * jnp.eye(DOF, dtype=matrix.diagonal.dtype)
+    return BlockTridiagonal(matrix.diagonal * scale, matrix.coupling)
+
+
+def _no_probe(error: Array, loop: _Loop, inputs: Any) -> None:
+    return None
+
+
+def _gradient(error: Array, probed: None, loop: _Loop, inputs: Any) -> Array:
+    """Return the gradient at the states that ``error`` leads to from the solution: zero at zero."""
+    return _report(error, probed, loop, inputs)[1].gradient.ravel()
+
+
+def _report(error: Array, probed: None, loop: _Loop, inputs: Any) -> tuple[MotionState, Normal]:
+    chain = inputs[0]
+    states = loop.states.retract(error.reshape(-1, DOF))
+    return states, linearise(chain, information_of(chain), states)
+
+
+def _inverse_hessian(error: Array, loop: _Loop, inputs: Any, right: Array) -> Array:
+    chain = inputs[0]
+    exact = linearise(chain, information_of(chain), loop.states, exact=True)
+    return solve(factorise(exact.matrix), right.reshape(-1, DOF)).ravel()
