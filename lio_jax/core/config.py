@@ -63,6 +63,10 @@ class ImuConfig:
     """Takes the place of ``config.lidar.registration_points``: with inertial samples fewer points will do."""
     insertion_points: int = 8192
     """Takes the place of ``config.lidar.insertion_points``."""
+    orientation: bool = False
+    """Use the attitude that a 9-axis IMU reports itself, where the recipe can (lio_sam)."""
+    heading: bool = False
+    """Begin with its heading too."""
 
 
 @dataclass(frozen=True)

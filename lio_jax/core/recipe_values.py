@@ -64,6 +64,7 @@ RECIPE_VALUES: dict[str, dict[str, Any]] = {
         "config.features.columns": 0,
         "config.features.surface_points": 0,
         "config.features.order": "azimuth",
+        "config.imu.orientation": True,
         "config.map.capacity": 65536,
         "config.registration.max_iterations": 30,
         "params.imu.gyro_noise": 1.5636343949698187e-03,

@@ -41,6 +41,8 @@ class ImuBatch(eqx.Module):
     """Specific force in the IMU frame, m/s^2: +g upwards at rest."""
     mask: Bool[Array, " m"]
     """True where a sample is real."""
+    orientation: Float[Array, "m 4"] | None = None
+    """What the IMU itself says of its attitude in world, xyzw; None where it says nothing or nobody asks."""
 
 
 class NavState(eqx.Module):

@@ -55,7 +55,7 @@ def open_window(capacity: int, prior: Prior, gravity: Float[Array, "3"], first: 
             that follow have relative poses and GPS where these have.
     """
     padding = Added(
-        link=_still(prior.gradient.dtype),
+        link=still_link(prior.gradient.dtype),
         lidar=dataclasses.replace(first.lidar, mask=jnp.array(False)),
         relative=first.relative and dataclasses.replace(first.relative, mask=jnp.array(False)),
         gps=first.gps and dataclasses.replace(first.gps, mask=jnp.array(False)),
@@ -138,7 +138,7 @@ def _with_measurements(window: Window, added: Added, row: Array) -> Window:
     return Window(chain, window.states)
 
 
-def _still(dtype: jnp.dtype) -> Preintegrated:
+def still_link(dtype: jnp.dtype) -> Preintegrated:
     """Return a link that is padding."""
     return Preintegrated(
         duration=jnp.zeros((), dtype),

@@ -55,6 +55,4 @@ def noise_shares(
 
 
 def _densities(params: ImuParams) -> Float[Array, "4"]:
-    return jnp.stack(
-        [params.gyro_noise, params.accel_noise, params.gyro_bias_walk, params.accel_bias_walk]
-    )
+    return jnp.stack([params.gyro_noise, params.accel_noise, params.gyro_bias_walk, params.accel_bias_walk])

@@ -3,9 +3,14 @@
 from types import ModuleType
 
 from lio_jax.core.errors import UsageError
-from lio_jax.recipes import default, fast_lio2, loam
+from lio_jax.recipes import default, fast_lio2, lio_sam, loam
 
-RECIPES: dict[str, ModuleType] = {"default": default, "fast_lio2": fast_lio2, "loam": loam}
+RECIPES: dict[str, ModuleType] = {
+    "default": default,
+    "fast_lio2": fast_lio2,
+    "lio_sam": lio_sam,
+    "loam": loam,
+}
 """By name; each module has State, Output, init(config, params, imu), step(config, params, state, scan, imu),
 restart(config, params, state, imu) and moving_as(fresh, found), what a restart adds to init."""
 

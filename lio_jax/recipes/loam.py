@@ -22,7 +22,7 @@ from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan, initial_nav_state
 from lio_jax.lidar.deskew import deskew_constant_velocity
 from lio_jax.lidar.features import FeatureCloud, LoamFeatures, loam_features
-from lio_jax.lidar.voxel_mean import mean_per_voxel
+from lio_jax.lidar.thinned_features import in_single_precision, thinned_features
 from lio_jax.recipes.output import Output
 from lio_jax.registration.cube_map import ScanToCubes, added_to
 from lio_jax.registration.feature_map import FeatureMap, empty_feature_map, frames_at, placed_in
@@ -117,7 +117,7 @@ def step(
     """
     first = state.scans == 0
     with jax.named_scope("features"):
-        features = _features(config, params, scan)
+        features = in_single_precision(loam_features, config, params, scan)
         enough = jnp.sum(features.sharp.mask) + jnp.sum(features.flat.mask) > params.registration.min_matches
     with jax.named_scope("predict"):
         middle = 0.5 * scan.duration.astype(state.twist.dtype)
@@ -138,7 +138,10 @@ def step(
         T_odom_lidar = state.T_odom_lidar @ odometry.T_world_lidar
         twist = motion.twist_to(odometry.T_world_lidar)
     with jax.named_scope("scan_to_map"):
-        corner, surface, thinned_away = _thinned(config, params, features)
+        room = config.loam.corner_points, config.loam.surface_points
+        corner, surface, thinned_away = thinned_features(
+            features.less_sharp, features.less_flat, params, *room
+        )
         thin = _Compensated(corner, surface, motion, config.loam.compensate)(odometry.T_world_lidar)
         guess = state.T_map_odom @ T_odom_lidar
         its_turn = state.scans % config.loam.mapping_every == 0
@@ -222,37 +225,6 @@ class _Compensated(eqx.Module):
             for cloud in (self.corner, self.surface)
         )
         return FeaturePoints(corner, self.corner.mask, surface, self.surface.mask)
-
-
-def _features(config: Config, params: Params, scan: Scan) -> LoamFeatures:
-    """Pick in single precision: which points they are has no derivative."""
-    dtype = scan.points.dtype
-    single = dataclasses.replace(
-        scan, points=scan.points.astype(jnp.float32), time=scan.time.astype(jnp.float32)
-    )
-    found = loam_features(config, params, single)
-    return jax.tree.map(lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, found)
-
-
-def _thinned(
-    config: Config, params: Params, features: LoamFeatures
-) -> tuple[FeatureCloud, FeatureCloud, Int32[Array, ""]]:
-    """Return corners and surface points to match with the map, and how many found no room.
-
-    They are averaged before the compensation and not after it, so that the groups do not depend on the
-    motion: points as near to each other as these are moved alike.
-    """
-    kinds = (
-        (features.less_sharp, params.map.corner_voxel_size, config.loam.corner_points),
-        (features.less_flat, params.map.voxel_size, config.loam.surface_points),
-    )
-    clouds, dropped = [], jnp.int32(0)
-    for cloud, size, capacity in kinds:
-        mean = mean_per_voxel(cloud.points, cloud.mask, size.astype(jnp.float32), capacity, cloud.time)
-        assert mean.time is not None
-        clouds.append(FeatureCloud(mean.points, mean.time, jnp.zeros(capacity, jnp.int32), mean.mask))
-        dropped += mean.dropped
-    return clouds[0], clouds[1], dropped
 
 
 def _mapped(

@@ -24,6 +24,7 @@ class ImuFeed:
         buckets: tuple[int, ...],
         time_offset: float = 0.0,
         margin_s: float = OFFSET_MARGIN_S,
+        orientation: bool = False,
     ) -> None:
         """Keep the recording's samples.
 
@@ -32,11 +33,16 @@ class ImuFeed:
             buckets: padded sizes, ascending.
             time_offset: a scan stamped t was taken at IMU time t + time_offset, s.
             margin_s: how far an offset that is estimated may move from ``time_offset``; 0 where it is frozen.
+            orientation: hand the IMU's own orientations on, where it reports any.
         """
         count = 0 if imu is None else len(imu.stamp_ns)
         self._imu = imu if count else None
         self._stamps = np.zeros(0, np.int64) if imu is None else imu.stamp_ns
         values = np.zeros((0, 6)) if imu is None else np.concatenate([imu.gyro, imu.accel], axis=1)
+        self._with_orientation = orientation and imu is not None and imu.orientation is not None
+        if self._with_orientation:
+            assert imu is not None and imu.orientation is not None
+            values = np.concatenate([values, imu.orientation], axis=1)
         self._values = np.ascontiguousarray(values, state_dtype())
         self._buckets = buckets
         self._offset_ns = round(time_offset * 1e9)
@@ -115,7 +121,7 @@ class ImuFeed:
             keep = first + np.linspace(0, count - 1, size).astype(np.intp)
         filled = min(count, size)
         seconds = np.empty(size, self._values.dtype)
-        values = np.empty((size, 6), self._values.dtype)
+        values = np.empty((size, self._values.shape[1]), self._values.dtype)
         seconds[:filled] = (self._stamps[keep] - origin_ns) * 1e-9
         values[:filled] = self._values[keep]
         seconds[filled:] = seconds[filled - 1] if filled else 0
@@ -126,7 +132,9 @@ class ImuFeed:
         arrays: dict[str, Any] = {
             "time": seconds,
             "gyro": values[:, :3],
-            "accel": values[:, 3:],
+            "accel": values[:, 3:6],
             "mask": mask,
         }
+        if self._with_orientation:
+            arrays["orientation"] = values[:, 6:]
         return ImuBatch(**arrays)

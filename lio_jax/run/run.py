@@ -180,7 +180,8 @@ def imu_feed(sequence: Sequence, settings: Settings) -> tuple[ImuFeed | None, tu
     estimated = settings.values["initial"]["time_offset_sigma"] > 0
     margin = OFFSET_MARGIN_S if estimated else 0.0
     offset = settings.values["extrinsics"]["time_offset"]
-    return ImuFeed(imu, settings.config.imu.buckets, offset, margin), found
+    own = settings.config.imu.orientation
+    return ImuFeed(imu, settings.config.imu.buckets, offset, margin, own), found
 
 
 def check_start(sequence: Sequence, start: int) -> None:

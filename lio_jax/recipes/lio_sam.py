@@ -1,0 +1,266 @@
+"""LIO-SAM: scan matching against keyframes, and a smoother that ties its poses to the inertial samples.
+
+imu  -> preintegrate -> predict ----------------> smoother (window of states) -> velocity, biases
+                           |                         |
+scan -> features -> thin -> deskew -> scan to submap / -> keyframe? -> submap (lines and planes)
+
+Shan, Englot, Meyers, Wang, Ratti & Rus, "LIO-SAM: Tightly-coupled lidar inertial odometry via smoothing and
+mapping", IROS 2020, in its program's form; a sliding window takes ISAM2's place. Its values are those of
+``recipe_settings("lio_sam")``.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float, Int32
+
+from lio_jax.core.blocks import from_blocks
+from lio_jax.core.config import Config
+from lio_jax.core.error_state import DOF as NAV_DOF
+from lio_jax.core.errors import UsageError
+from lio_jax.core.params import Params
+from lio_jax.core.types import ImuBatch, NavState, Scan
+from lio_jax.estimation.motion_state import DOF
+from lio_jax.estimation.sliding_window import Added, Window, append_and_update
+from lio_jax.estimation.smoother import Smoothed
+from lio_jax.imu.path import Path, deskew_along
+from lio_jax.imu.preintegration import preintegrate_parallel
+from lio_jax.imu.sampling import sample_intervals
+from lio_jax.imu.strapdown import path_along
+from lio_jax.lidar.features import FeatureCloud, lio_sam_features
+from lio_jax.lidar.thinned_features import in_single_precision, thinned_features
+from lio_jax.mapping.keyframes import is_due, no_keyframes
+from lio_jax.recipes.inertial_filter import levelled_start, lidar_pose
+from lio_jax.recipes.output import Output
+from lio_jax.recipes.pose_limits import drawn_to_tilt, measured_attitude, within_limits
+from lio_jax.recipes.smoothed_odometry import match_as_measurement, opened, runs_away
+from lio_jax.registration.feature_map import empty_feature_map
+from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES
+from lio_jax.registration.lines_and_planes import FeaturePoints
+from lio_jax.registration.rounds import match_in_rounds
+from lio_jax.registration.submap import ScanToSubmap, Submap, with_scan
+
+_LEAST_CORNERS, _LEAST_SURFACES = 10, 100
+"""Below these a scan is not matched."""
+
+
+class State(eqx.Module):
+    """What is carried from scan to scan."""
+
+    nav: NavState
+    """At the last scan's end: the matched pose, velocity and biases of the smoother."""
+    window: Window
+    """The smoother's states, the latest at the last scan's end."""
+    time: Float[Array, ""]
+    """Since the first scan's end, s."""
+    matched_at: Float[Array, ""]
+    """The same of the last scan that was matched."""
+    scans: Int32[Array, ""]
+    """Scans with points seen so far."""
+    map: Submap
+
+
+def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
+    """Return the state before the first scan: at the world's origin, levelled, with an empty map.
+
+    Args:
+        config: static.
+        params: traced.
+        imu: samples of about a second up to the first scan's end.
+
+    Raises:
+        UsageError: there are no inertial data.
+    """
+    features, own = config.features, config.lio_sam
+    if imu is None:
+        raise UsageError(
+            "the recipe lio_sam needs inertial samples, and there are none (or config.imu.use is false); "
+            "take loam, or default."
+        )
+    if not (features.rings and features.columns and features.surface_points):
+        raise UsageError(
+            "config.features.rings, columns and surface_points are 0, for by the recording; "
+            "take the settings from settings_for(sequence, settings), or set them."
+        )
+    nav = levelled_start(params, imu).nav
+    attitude, there = measured_attitude(imu, jnp.max(imu.time), nav.T_world_imu.rotation())
+    if not config.imu.heading:
+        level = attitude.as_rpy_radians()
+        attitude = jaxlie.SO3.from_rpy_radians(level.roll, level.pitch, jnp.zeros_like(level.yaw))
+    rotation = jaxlie.SO3(jnp.where(there, attitude.wxyz, nav.T_world_imu.rotation().wxyz))
+    T_world_imu = jaxlie.SE3.from_rotation_and_translation(rotation, nav.T_world_imu.translation())
+    nav = dataclasses.replace(nav, T_world_imu=T_world_imu)
+    zero = jnp.zeros((), nav.velocity.dtype)
+    keyframes = no_keyframes(own.keyframes, own.corner_points, own.surface_points, zero.dtype)
+    return State(
+        nav=nav,
+        window=opened(config, params, nav),
+        time=zero,
+        matched_at=zero - jnp.inf,
+        scans=jnp.int32(0),
+        map=Submap(keyframes, empty_feature_map(config.map.capacity)),
+    )
+
+
+def restart(config: Config, params: Params, state: State, imu: ImuBatch | None = None) -> State:
+    """Return the state before the first scan once more, now with the velocity that ``state`` found.
+
+    A vehicle that is already moving distorts its first scan, which nothing can compensate until the second.
+    """
+    return moving_as(init(config, params, imu), state)
+
+
+def moving_as(fresh: State, found: State) -> State:
+    """Return the state before the first scan with the velocity of another: a mere exchange of leaves."""
+    rows = fresh.window.states.velocity
+    velocity = found.nav.velocity
+
+    def places(state: State) -> tuple:
+        window = state.window
+        return state.nav.velocity, window.states.velocity, window.chain.prior.origin.velocity
+
+    return eqx.tree_at(places, fresh, (velocity, jnp.broadcast_to(velocity, rows.shape), velocity))
+
+
+def step(
+    config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch | None = None
+) -> tuple[State, Output]:
+    """Predict by the inertial samples, match one scan with the keyframes around, smooth the window.
+
+    Args:
+        config: static.
+        params: traced.
+        state: donate it.
+        scan: padded sweep; ``scan.interval`` is the time since the last scan's end.
+        imu: samples around that time.
+    """
+    assert imu is not None
+    first = state.scans == 0
+    dtype = state.nav.velocity.dtype
+    end = scan.duration.astype(dtype)
+    interval = jnp.where(first, 0.0, scan.interval.astype(dtype))
+    time = state.time + interval
+    with jax.named_scope("features"):
+        features = in_single_precision(lio_sam_features, config, params, scan)
+        room = config.lio_sam.corner_points, config.lio_sam.surface_points
+        corner, surface, thinned_away = thinned_features(features.corner, features.surface, params, *room)
+        seen = jnp.any(features.surface.mask)
+        enough = (jnp.sum(corner.mask) >= _LEAST_CORNERS) & (jnp.sum(surface.mask) >= _LEAST_SURFACES)
+    with jax.named_scope("predict"):
+        odometry = _as_nav(state.nav, state.window)
+        # the first scan's end is the world's origin: its samples only deskew it
+        path = path_along(odometry, imu, jnp.where(first, 0.0, end - interval), end)
+        predicted = jaxlie.SE3(path.T_world_imu.wxyz_xyz[-1])
+        moved = odometry.T_world_imu.inverse() @ predicted
+        guess = jaxlie.SE3(
+            jnp.where(first, state.nav.T_world_imu.wxyz_xyz, (state.nav.T_world_imu @ moved).wxyz_xyz)
+        )
+        points = _compensated(corner, surface, path, state.nav.T_imu_lidar)
+    with jax.named_scope("scan_to_map"):
+        task = ScanToSubmap(
+            map=state.map.features,
+            points=points,
+            T_predicted=jaxlie.SE3((guess @ state.nav.T_imu_lidar).wxyz_xyz),
+            params=params,
+            neighbours=config.knn.neighbours,
+        )
+        match = match_in_rounds(task, config.registration.max_iterations, 1)
+        due = time - state.matched_at >= params.smoother.mapping_interval - _TIME_SLACK
+        lost = ((match.status == TOO_FEW_MATCHES) | ~enough) & ~first
+        matched = due & ~lost & ~first
+        T_matched = match.T_world_lidar @ state.nav.T_imu_lidar.inverse()
+        attitude, _ = measured_attitude(imu, end + state.nav.time_offset, guess.rotation())
+        T_matched = drawn_to_tilt(T_matched, attitude, params.smoother.tilt_weight)
+        T_matched = within_limits(T_matched, params.smoother)
+        T_world_imu = jaxlie.SE3(jnp.where(matched, T_matched.wxyz_xyz, guess.wxyz_xyz))
+    with jax.named_scope("smooth"):
+        intervals = sample_intervals(imu, state.nav.time_offset, end - interval, end)
+        latest = state.window.latest()
+        link = preintegrate_parallel(intervals, latest.gyro_bias, latest.accel_bias, params.imu)
+        measured = match_as_measurement(config, params, T_world_imu, match, matched)
+        window, smoothed = append_and_update(
+            state.window,
+            Added(link, measured),
+            max_iterations=config.lio_sam.smoother_iterations,
+            tolerance=params.smoother.tolerance,
+        )
+        failed = runs_away(window.latest(), params)
+        fresh = opened(config, params, _at_rest(state.nav, T_world_imu))
+        keep = first | failed
+        kept = jax.tree.map(lambda old, new: jnp.where(first, old, new), state.window, fresh)
+        window = jax.tree.map(lambda new, old: jnp.where(keep, old, new), window, kept)
+    nav = dataclasses.replace(_as_nav(state.nav, window), T_world_imu=T_world_imu)
+    with jax.named_scope("keyframe"):
+        # the map is a constant of the derivative
+        T_world_lidar, still = jax.lax.stop_gradient((lidar_pose(nav), points))
+        keyframe = (matched | (first & seen)) & is_due(state.map.keyframes, T_world_lidar, params.submap)
+        submap, frames, placed, added = with_scan(
+            state.map, keyframe, still, T_world_lidar, jax.lax.stop_gradient(time), params
+        )
+    new_state = State(
+        nav=nav,
+        window=window,
+        time=time,
+        matched_at=jnp.where(matched | first, time, state.matched_at),
+        scans=state.scans + seen.astype(jnp.int32),
+        map=submap,
+    )
+    corners, surfaces = len(placed.corner), len(placed.surface)
+    offset = (frames.corner.origin - frames.surface.origin).astype(placed.corner.dtype)
+    return new_state, Output(
+        registration=dataclasses.replace(match, T_world_lidar=lidar_pose(nav)),
+        lost=lost,
+        nis=jnp.zeros_like(end),
+        nis_dof=jnp.int32(0),
+        points=jnp.concatenate([placed.corner + offset, placed.surface]),
+        points_mask=jnp.concatenate([placed.corner_mask, placed.surface_mask]),
+        added=jnp.concatenate([added[0].added[:corners], added[1].added[:surfaces]]),
+        origin=frames.surface.origin,
+        thinned_away=thinned_away + features.dropped,
+        map_dropped=added[0].dropped + added[1].dropped,
+        covariance=_covariance(smoothed, window),
+    )
+
+
+_TIME_SLACK = 1e-3
+"""Sweeps do not end to the last bit in time, s."""
+
+
+def _as_nav(nav: NavState, window: Window) -> NavState:
+    """Return the navigation state with the latest of the window's."""
+    latest = window.latest()
+    return dataclasses.replace(
+        nav,
+        T_world_imu=jaxlie.SE3(latest.T_world_imu.wxyz_xyz),
+        velocity=latest.velocity,
+        gyro_bias=latest.gyro_bias,
+        accel_bias=latest.accel_bias,
+    )
+
+
+def _at_rest(nav: NavState, T_world_imu: jaxlie.SE3) -> NavState:
+    """Return what the smoother begins with after a failure: any velocity is as likely."""
+    zero = jnp.zeros_like(nav.velocity)
+    return dataclasses.replace(nav, T_world_imu=T_world_imu, velocity=zero, gyro_bias=zero, accel_bias=zero)
+
+
+def _compensated(
+    corner: FeatureCloud, surface: FeatureCloud, path: Path, T_imu_lidar: jaxlie.SE3
+) -> FeaturePoints:
+    """Return features as the sensor would have seen them from where it was at the scan's end."""
+    return FeaturePoints(
+        corner=deskew_along(path, T_imu_lidar, corner.points, corner.time),
+        corner_mask=corner.mask,
+        surface=deskew_along(path, T_imu_lidar, surface.points, surface.time),
+        surface_mask=surface.mask,
+    )
+
+
+def _covariance(smoothed: Smoothed, window: Window) -> Float[Array, "24 24"]:
+    """Return the marginal covariance of the latest state, at its place in the navigation state's error."""
+    latest = smoothed.covariances()[window.chain.count - 1]
+    motion = slice(0, DOF)
+    return from_blocks((NAV_DOF, NAV_DOF), (motion, motion, latest))

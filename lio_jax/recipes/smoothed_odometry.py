@@ -1,0 +1,85 @@
+"""LIO-SAM's IMU odometry: a window of states between which inertial samples are preintegrated.
+
+Its graph of preintegration factors and scan matches as priors of the poses; where LIO-SAM starts a new graph
+every 100 states from the marginal covariance, the window marginalises its oldest state at each step.
+"""
+
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool
+
+from lio_jax.core.blocks import from_blocks
+from lio_jax.core.config import Config
+from lio_jax.core.error_state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
+from lio_jax.core.params import Params
+from lio_jax.core.types import NavState
+from lio_jax.estimation.marginal_prior import gaussian_prior
+from lio_jax.estimation.motion_state import DOF, MotionState
+from lio_jax.estimation.pose_factors import PoseMeasurement, fixed_information
+from lio_jax.estimation.pose_logarithm import adjoint
+from lio_jax.estimation.sliding_window import Added, Window, open_window, still_link
+from lio_jax.registration.gauss_newton import Registration
+
+
+def opened(config: Config, params: Params, nav: NavState) -> Window:
+    """Return the window with one state, around which ``params.initial`` says how far the truth may lie."""
+    initial, smoother = params.initial, params.smoother
+    identity = jnp.eye(3, dtype=nav.velocity.dtype)
+    sigmas = (
+        (ROTATION, initial.rotation_sigma),
+        (POSITION, smoother.position_sigma),
+        (VELOCITY, initial.velocity_sigma),
+        (GYRO_BIAS, initial.gyro_bias_sigma),
+        (ACCEL_BIAS, initial.accel_bias_sigma),
+    )
+    # a frozen part of the state is one that hardly moves
+    blocks = ((part, part, jnp.maximum(sigma, 1e-6) ** 2 * identity) for part, sigma in sigmas)
+    covariance = from_blocks((DOF, DOF), *blocks)
+    prior = gaussian_prior(MotionState.of(nav), covariance)
+    unmatched = PoseMeasurement(
+        nav.T_world_imu,
+        fixed_information(smoother.rotation_sigma, smoother.translation_sigma),
+        smoother.kernel,
+        jnp.array(False),
+    )
+    first = Added(still_link(nav.velocity.dtype), unmatched)
+    return open_window(config.lio_sam.window, prior, nav.gravity, first)
+
+
+def match_as_measurement(
+    config: Config, params: Params, T_world_imu: jaxlie.SE3, match: Registration, there: Bool[Array, ""]
+) -> PoseMeasurement:
+    """Return what a scan match says of the IMU's pose.
+
+    Args:
+        config: ``config.lio_sam.lidar_noise``.
+        params: ``params.smoother``.
+        T_world_imu: the pose.
+        match: it comes from.
+        there: whether there was one.
+    """
+    if config.lio_sam.lidar_noise == "information":
+        by_imu = adjoint(params.extrinsics.T_imu_lidar().inverse())
+        information = params.registration.information_scale * (by_imu.T @ match.information @ by_imu)
+    else:
+        smoother = params.smoother
+        degenerate = jnp.any(match.degenerate)
+        sigmas = (
+            jnp.where(degenerate, smoother.degenerate_sigma, sigma)
+            for sigma in (smoother.rotation_sigma, smoother.translation_sigma)
+        )
+        information = fixed_information(*sigmas)
+    return PoseMeasurement(T_world_imu, information, params.smoother.kernel, there)
+
+
+def runs_away(state: MotionState, params: Params) -> Bool[Array, ""]:
+    """Return whether velocity or biases are beyond ``params.limits``, or not finite."""
+    limits = params.limits
+    sizes = (
+        (state.velocity, limits.speed),
+        (state.gyro_bias, limits.gyro_bias),
+        (state.accel_bias, limits.accel_bias),
+    )
+    # not "larger than": that would be false of what is not finite
+    within = [jnp.linalg.norm(vector) <= limit for vector, limit in sizes]
+    return ~jnp.all(jnp.stack([*within, jnp.all(jnp.isfinite(state.T_world_imu.wxyz_xyz))]))
