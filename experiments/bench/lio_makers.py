@@ -43,11 +43,12 @@ def peer(name: str, threads: int, recording: Path) -> System:
 
 def ours(recipe: str, overrides: tuple[str, ...], threads: int, recording: Path) -> System:
     """Return one of our recipes, fresh."""
-    from lio_jax_system import LioJaxSystem
+    from lio_jax_system import LioJaxSystem, sizes_for
 
     sequence = NativeSequence(recording, DataConfig())
     extrinsic = sequence.info.T_imu_lidar
     assert extrinsic is not None
+    overrides = (*sizes_for(recipe, list(sequence.scans(0, 10))), *overrides)
     return LioJaxSystem(threads, np.asarray(extrinsic), overrides, sequence, recipe)
 
 

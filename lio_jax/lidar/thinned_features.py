@@ -21,7 +21,7 @@ _Features = TypeVar("_Features")
 def in_single_precision(
     pick: Callable[[Config, Params, Scan], _Features], config: Config, params: Params, scan: Scan
 ) -> _Features:
-    """Pick a scan's features in single precision, which has no say in a derivative; return them in the scan's."""
+    """Pick features in single precision, since which ones has no derivative; return them in the scan's."""
     dtype = scan.points.dtype
     single = dataclasses.replace(
         scan, points=scan.points.astype(jnp.float32), time=scan.time.astype(jnp.float32)

@@ -1,7 +1,7 @@
-"""Keyframes with their clouds, and which of them a scan should be matched with (LIO-SAM's surrounding keyframes).
+"""Keyframes with their clouds, and which of them the map should hold (LIO-SAM's surrounding keyframes).
 
-Shan et al., "LIO-SAM: Tightly-coupled lidar inertial odometry via smoothing and mapping", IROS 2020, sections
-III.C and IV, as its program selects them: near ones, one per so many metres, and the latest.
+Shan et al., "LIO-SAM: Tightly-coupled lidar inertial odometry via smoothing and mapping", IROS 2020, section
+III.C, as its program selects them: near ones, one per so many metres, and the latest.
 """
 
 import equinox as eqx

@@ -91,7 +91,7 @@ def placed_in(frames: Frames, points: FeaturePoints, T_world_lidar: jaxlie.SE3) 
 
 
 Follow = Callable[[PointMap, Frame, Float[Array, ""]], PointMap]
-"""Moves the box of a map, given the frame at the sensor and a block's length (m), and clears what is outside."""
+"""Moves the box of a map, given the frame at the sensor and a block's length (m), and clears the rest."""
 
 
 def added_to(

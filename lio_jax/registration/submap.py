@@ -1,7 +1,7 @@
 """The keyframes around the vehicle as one map of lines and planes, and scans against it (LIO-SAM).
 
-A keyframe's points are moved into the map once, when it is made or when the vehicle comes back to it; what has
-not moved is not touched again. LIO-SAM itself puts its map together anew for each scan.
+A keyframe's points are moved into the map once, when it is made or when the vehicle comes back to it; what
+has not moved is not touched again. LIO-SAM itself puts its map together anew for each scan.
 """
 
 import equinox as eqx

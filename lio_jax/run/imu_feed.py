@@ -39,10 +39,10 @@ class ImuFeed:
         self._imu = imu if count else None
         self._stamps = np.zeros(0, np.int64) if imu is None else imu.stamp_ns
         values = np.zeros((0, 6)) if imu is None else np.concatenate([imu.gyro, imu.accel], axis=1)
-        self._with_orientation = orientation and imu is not None and imu.orientation is not None
-        if self._with_orientation:
-            assert imu is not None and imu.orientation is not None
-            values = np.concatenate([values, imu.orientation], axis=1)
+        attitudes = imu.orientation if imu is not None and orientation else None
+        self._with_orientation = attitudes is not None
+        if attitudes is not None:
+            values = np.concatenate([values, attitudes], axis=1)
         self._values = np.ascontiguousarray(values, state_dtype())
         self._buckets = buckets
         self._offset_ns = round(time_offset * 1e9)
