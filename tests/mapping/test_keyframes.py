@@ -1,0 +1,108 @@
+"""Keyframes: when one is due, which row it takes, and which are to be in the map."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+
+from lio_jax.core.params import SubmapParams
+from lio_jax.mapping.keyframes import KeyframeCloud, is_due, next_to_enter, no_keyframes, with_keyframe
+
+CORNERS, SURFACES = 8, 16
+PARAMS = SubmapParams(*(jnp.asarray(value) for value in (1.0, 0.2, 50.0, 2.0, 10.0)))
+_add = jax.jit(partial(with_keyframe, params=PARAMS))
+_enter = jax.jit(partial(next_to_enter, params=PARAMS))
+
+
+def pose(x: float, y: float = 0.0, yaw: float = 0.0) -> jaxlie.SE3:
+    return jaxlie.SE3.from_rotation_and_translation(
+        jaxlie.SO3.from_z_radians(jnp.asarray(yaw)), jnp.array([x, y, 0.0])
+    )
+
+
+def cloud(number: int) -> KeyframeCloud:
+    """Return points that tell their keyframe, with gaps between them."""
+    rng = np.random.default_rng(number)
+    masks = rng.uniform(size=CORNERS) < 0.5, rng.uniform(size=SURFACES) < 0.7
+    points = [rng.normal(size=(count, 3)).astype(np.float32) for count in (CORNERS, SURFACES)]
+    return KeyframeCloud(
+        jnp.asarray(points[0]), jnp.asarray(masks[0]), jnp.asarray(points[1]), jnp.asarray(masks[1])
+    )
+
+
+def empty(capacity: int = 64):
+    return no_keyframes(capacity, CORNERS, SURFACES, jnp.dtype(jnp.float64))
+
+
+def added(keyframes, T, time: float, number: int = 0, keep: bool = True):
+    return _add(keyframes, jnp.array(keep), T, jnp.asarray(time), cloud(number))
+
+
+@pytest.mark.parametrize(
+    ("moved", "due"),
+    [
+        (pose(1.999), False),
+        (pose(2.001), True),
+        (pose(1.0, yaw=0.199), False),
+        (pose(1.0, yaw=-0.201), True),
+        (pose(1.0, 0.99), False),
+        (pose(0.0), True),
+    ],
+)
+def test_a_keyframe_is_due_after_a_metre_or_a_fifth_of_a_radian(moved, due):
+    assert bool(is_due(empty(), pose(0.0), PARAMS))
+    assert bool(is_due(added(empty(), pose(1.0), 0.0), moved, PARAMS)) == due
+
+
+def test_a_scan_that_is_none_leaves_everything_as_it_was():
+    before = added(empty(), pose(0.0), 0.0, 1)
+    after = added(before, pose(9.0), 1.0, 2, keep=False)
+    jax.tree.map(np.testing.assert_array_equal, before, after)
+
+
+def test_its_points_come_back_from_where_it_is():
+    keyframes = empty()
+    for number in range(30):
+        keyframes = added(keyframes, pose(4.0 * number), float(number), number)
+    # 116 m away and back: those beyond 50 m have to enter anew
+    keyframes, _, nothing = _enter(keyframes, pose(116.0), jnp.asarray(60.0))
+    assert not nothing.corner_mask.any()
+    assert not nothing.surface_mask.any()
+    seen = []
+    for step in range(40):
+        keyframes, T, found = _enter(keyframes, pose(0.0), jnp.asarray(61.0 + step))
+        if not found.surface_mask.any():
+            continue
+        number = round(float(T.translation()[0]) / 4)
+        seen.append(number)
+        held = cloud(number)
+        for got, mask, own, own_mask in (
+            (found.corner, found.corner_mask, held.corner, held.corner_mask),
+            (found.surface, found.surface_mask, held.surface, held.surface_mask),
+        ):
+            np.testing.assert_array_equal(np.asarray(got)[mask], np.asarray(own)[own_mask])
+    # nearest first, each once
+    assert seen == list(range(13))
+
+
+def test_one_keyframe_per_two_metres_is_kept_for_later():
+    keyframes = empty()
+    for number in range(20):
+        keyframes = added(keyframes, pose(float(number)), 0.1 * number, number)
+    sparse = np.asarray(keyframes.sparse)[:20]
+    np.testing.assert_array_equal(sparse, np.arange(20) % 2 == 0)
+
+
+def test_rows_of_what_is_not_needed_any_more_are_taken_first():
+    keyframes = empty(12)
+    # a second apart, a metre apart: every other one is sparse; ten seconds are recent
+    for number in range(30):
+        keyframes = added(keyframes, pose(float(number)), float(number), number)
+    held = np.sort(np.asarray(keyframes.time))
+    # the last eleven are recent; of the older ones only one has room, and it is the last that was sparse
+    np.testing.assert_array_equal(held[-11:], np.arange(19, 30))
+    assert held[0] == 18
+    assert int(keyframes.last) == int(np.argmax(np.asarray(keyframes.time)))

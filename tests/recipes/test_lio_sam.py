@@ -1,0 +1,280 @@
+"""The recipe lio_sam on simulated recordings whose truth is known."""
+
+import operator
+import re
+import warnings
+from dataclasses import replace
+from functools import cache, partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lio_jax.core.error_state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
+from lio_jax.core.errors import UsageError
+from lio_jax.core.params import DEFAULTS, Params
+from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
+from lio_jax.core.types import ImuBatch
+from lio_jax.recipes import lio_sam, recipe_named
+from lio_jax.run.compilation import PerShape
+from lio_jax.run.feed import padded
+from lio_jax.run.imu_feed import ImuFeed
+from tests.recipes.test_fast_lio2 import ate, recording, truth
+
+SMALL = [
+    "config.lidar.buckets=[8192]",
+    "config.imu.buckets=[64]",
+    "config.map.capacity=16384",
+    "config.lio_sam.window=4",
+    "config.lio_sam.keyframes=16",
+    "config.lio_sam.corner_points=1024",
+    "config.lio_sam.surface_points=2048",
+    "config.features.rings=16",
+    "config.features.columns=576",
+    "config.features.surface_points=6144",
+]
+SCANS, MOVING = 30, 12
+
+
+def settings_with(*sets: str) -> Settings:
+    T_imu_lidar = recording()[0].info.T_imu_lidar
+    return with_overrides(with_extrinsics(recipe_settings("lio_sam"), T_imu_lidar, "test"), [*SMALL, *sets])
+
+
+CONFIG = settings_with().config
+PARAMS = settings_with().params()
+# compiled as the runner's are
+INIT = PerShape(jax.jit(partial(lio_sam.init, CONFIG)))
+STEP = PerShape(jax.jit(partial(lio_sam.step, CONFIG)))
+
+
+@cache
+def arrays():
+    """Return each scan's padded arrays and its samples, and the samples before the first."""
+    _, scans, imu = recording()
+    feed, last, inputs = ImuFeed(imu, CONFIG.imu.buckets, 0.0, 0.0), None, []
+    for scan in scans:
+        pair = padded(scan, last, CONFIG.lidar), feed.batch(scan, last)
+        inputs.append(jax.tree.map(jnp.asarray, pair))
+        last = scan.end_ns
+    return inputs, jax.tree.map(jnp.asarray, feed.before(scans[0]))
+
+
+def run(params: Params = PARAMS, change=lambda number, scan, imu: (scan, imu), count: int = SCANS):
+    """Return states and outputs of each scan, and T_world_imu."""
+    inputs, before = arrays()
+    state, states, outputs = INIT(params, before), [], []
+    for number in range(count):
+        state, output = STEP(params, state, *change(number, *inputs[number]))
+        states.append(state)
+        outputs.append(output)
+    poses = np.stack([np.asarray(state.nav.T_world_imu.as_matrix()) for state in states])
+    return states, outputs, poses
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return run()
+
+
+def speed_at(number: int) -> float:
+    return float(np.linalg.norm(truth()[number, :3, 3] - truth()[number - 1, :3, 3]) / 0.1)
+
+
+def test_a_drive_is_tracked(drive):
+    states, outputs, poses = drive
+    assert np.linalg.norm(truth()[-1, :3, 3] - truth()[0, :3, 3]) > 1
+    assert ate(poses) < 0.03
+    assert not any(output.lost for output in outputs)
+    assert all(output.registration.matches > 200 for output in outputs[1:])
+    assert np.linalg.norm(states[-1].nav.velocity) == pytest.approx(speed_at(SCANS - 1), abs=0.15)
+
+
+def test_the_world_is_level(drive):
+    _, _, poses = drive
+    up = np.einsum("nij,nj->ni", poses[:, :3, :3], truth()[:, 2, :3])
+    tilt = np.arccos(np.clip(up[:, 2], -1, 1))
+    assert np.degrees(tilt).max() < 0.5
+
+
+def test_keyframes_are_a_metre_apart_and_the_rest_leaves_the_map_alone(drive):
+    states, outputs, poses = drive
+    made = [bool(output.added.any()) for output in outputs]
+    last = poses[0]
+    for number in range(1, SCANS):
+        between = np.linalg.inv(last) @ poses[number]
+        angle = Rotation.from_matrix(between[:3, :3]).magnitude()
+        # the lidar's own distance differs by the lever arm's
+        far = np.linalg.norm(between[:3, 3]) > 1.05 or angle > 0.22
+        near = np.linalg.norm(between[:3, 3]) < 0.95 and angle < 0.18
+        assert made[number] or not far
+        assert not (made[number] and near)
+        if made[number]:
+            last = poses[number]
+    assert made[0]
+    assert 1 < sum(made) < SCANS / 2
+    held = int(np.sum(np.isfinite(np.asarray(states[-1].map.keyframes.time))))
+    assert held == sum(made)
+
+
+def test_velocity_and_biases_have_a_covariance_that_shrinks(drive):
+    _, outputs, _ = drive
+    first, last = (np.sqrt(np.diagonal(np.asarray(outputs[k].covariance))) for k in (2, SCANS - 1))
+    for part in (ROTATION, POSITION, VELOCITY, GYRO_BIAS, ACCEL_BIAS):
+        assert (last[part] > 0).all()
+    assert (last[VELOCITY] < 0.7 * first[VELOCITY]).all()
+    # a walk of 3 s is all that was added
+    assert (last[GYRO_BIAS] < 1.1 * first[GYRO_BIAS]).all()
+
+
+def test_matching_at_most_every_quarter_second_leaves_the_rest_to_the_samples(drive):
+    states, _, poses = run(settings_with("params.smoother.mapping_interval=0.25").params())
+    matched = [float(state.matched_at) for state in states]
+    np.testing.assert_allclose(np.diff(sorted(set(matched)))[1:], 0.3, atol=1e-6)
+    assert ate(poses) < 0.06
+    assert np.abs(poses - drive[2]).max() > 1e-5
+
+
+def emptied(scan):
+    return replace(scan, mask=jnp.zeros_like(scan.mask))
+
+
+def test_an_empty_scan_is_predicted_over(drive):
+    _, outputs, poses = run(change=lambda k, scan, imu: (emptied(scan), imu) if k == MOVING else (scan, imu))
+    assert [bool(output.lost) for output in outputs] == [number == MOVING for number in range(SCANS)]
+    assert not outputs[MOVING].added.any()
+    np.testing.assert_allclose(poses[MOVING, :3, 3], drive[2][MOVING, :3, 3], atol=0.02)
+    assert ate(poses) < 0.03
+
+
+@pytest.mark.parametrize("value", [jnp.nan, jnp.inf])
+def test_points_that_are_not_finite_are_ignored(value):
+    def damaged(number, scan, imu):
+        bad = jnp.arange(len(scan.points)) % 7 == 3
+        points = jnp.where(bad[:, None], value, scan.points)
+        return replace(scan, points=points, mask=scan.mask & ~bad), imu
+
+    _, outputs, poses = run(change=damaged, count=MOVING + 4)
+    assert np.isfinite(poses).all()
+    assert not any(output.lost for output in outputs)
+    assert ate(poses) < 0.03
+
+
+def silent(imu: ImuBatch) -> ImuBatch:
+    return replace(imu, mask=jnp.zeros_like(imu.mask))
+
+
+def test_missing_samples_are_bridged_by_the_velocity():
+    gap = range(MOVING, MOVING + 2)
+    states, outputs, poses = run(change=lambda k, scan, imu: (scan, silent(imu) if k in gap else imu))
+    assert np.isfinite(poses).all()
+    assert not any(output.lost for output in outputs)
+    assert ate(poses) < 0.05
+    assert np.linalg.norm(states[-1].nav.velocity) == pytest.approx(speed_at(SCANS - 1), abs=0.3)
+
+
+def test_two_scans_of_one_instant_change_nothing():
+    def twice(number, scan, imu):
+        if number == MOVING:
+            # the scan before once more
+            scan, imu = arrays()[0][MOVING - 1]
+            scan = replace(scan, interval=jnp.zeros_like(scan.interval))
+        elif number > MOVING:
+            scan, imu = arrays()[0][number - 1]
+        return scan, imu
+
+    _, _, poses = run(change=twice, count=MOVING + 6)
+    np.testing.assert_allclose(poses[MOVING, :3, 3], poses[MOVING - 1, :3, 3], atol=0.01)
+    reference = run(count=MOVING + 5)[2]
+    np.testing.assert_allclose(poses[-1, :3, 3], reference[-1, :3, 3], atol=0.02)
+
+
+def test_a_runaway_bias_starts_the_smoother_anew():
+    def shaken(number, scan, imu):
+        wild = replace(imu, accel=imu.accel + 300.0)
+        return scan, wild if number == MOVING else imu
+
+    states, _, poses = run(change=shaken)
+    assert np.isfinite(poses).all()
+    counts = [int(state.window.chain.count) for state in states]
+    assert counts[MOVING - 1] == 4
+    assert 1 in counts[MOVING:]
+    assert counts[-1] == 4
+    assert np.abs(np.asarray(states[-1].nav.accel_bias)).max() < 1.0
+
+
+def test_information_in_place_of_fixed_sigmas():
+    chosen = settings_with("config.lio_sam.lidar_noise=information")
+    step = PerShape(jax.jit(partial(lio_sam.step, chosen.config)))
+    inputs, before = arrays()
+    state, params = INIT(chosen.params(), before), chosen.params()
+    for number in range(MOVING):
+        state, output = step(params, state, *inputs[number])
+    fixed = run(count=MOVING)[1][-1].covariance
+    assert np.sqrt(output.covariance[3, 3]) < 0.5 * np.sqrt(fixed[3, 3])
+
+
+def test_a_nine_axis_imu_levels_the_first_pose():
+    _, before = arrays()
+    attitude = Rotation.from_euler("ZYX", [0.7, 0.05, -0.1])
+    nine = replace(before, orientation=jnp.tile(jnp.asarray(attitude.as_quat()), (len(before.time), 1)))
+    for heading, yaw in ((False, 0.0), (True, 0.7)):
+        config = settings_with(f"config.imu.heading={str(heading).lower()}").config
+        state = jax.jit(partial(lio_sam.init, config))(PARAMS, nine)
+        found = Rotation.from_matrix(np.asarray(state.nav.T_world_imu.rotation().as_matrix()))
+        np.testing.assert_allclose(found.as_euler("ZYX"), [yaw, 0.05, -0.1], atol=1e-9)
+
+
+def test_without_samples_it_says_what_to_take_instead():
+    with pytest.raises(UsageError, match=r"lio_sam needs inertial samples.*take loam"):
+        lio_sam.init(CONFIG, PARAMS, None)
+
+
+def test_a_recipe_without_sizes_says_where_they_come_from():
+    with pytest.raises(UsageError, match=re.escape("settings_for(sequence, settings)")):
+        lio_sam.init(recipe_settings("lio_sam").config, PARAMS, arrays()[1])
+
+
+def test_a_restart_keeps_the_velocity_and_begins_anew(drive):
+    states, _, _ = drive
+    fresh = lio_sam.restart(CONFIG, PARAMS, states[-1], arrays()[1])
+    velocity = states[-1].nav.velocity
+    np.testing.assert_array_equal(fresh.nav.velocity, velocity)
+    np.testing.assert_array_equal(fresh.window.latest().velocity, velocity)
+    np.testing.assert_array_equal(fresh.nav.T_world_imu.translation(), 0)
+    assert int(fresh.scans) == 0
+
+
+def test_changing_any_parameter_recompiles_nothing(drive):
+    programs = len(STEP)
+    paths = [(section, name) for section, leaves in DEFAULTS.items() for name in leaves]
+    for section, name in paths:
+        at = operator.attrgetter(f"{section}.{name}")
+        changed = eqx.tree_at(at, PARAMS, replace_fn=lambda leaf: 1.01 * leaf)
+        state = INIT(changed, arrays()[1])
+    STEP(changed, state, *arrays()[0][0])
+    assert len(STEP) == programs
+
+
+def test_repeats_bit_for_bit(drive):
+    again = run(count=MOVING)[2]
+    np.testing.assert_array_equal(again, drive[2][:MOVING])
+
+
+def test_the_map_is_donated():
+    step = jax.jit(partial(lio_sam.step, CONFIG), donate_argnums=1)
+    inputs, before = arrays()
+    state = INIT(PARAMS, before)
+    block = state.map.features.surface.point
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        new, _ = step(PARAMS, state, *inputs[0])
+    assert block.is_deleted()
+    assert new.map.features.surface.point.shape == block.shape
+
+
+def test_recipe_is_found_by_its_name():
+    assert recipe_named("lio_sam") is lio_sam
