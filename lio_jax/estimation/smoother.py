@@ -62,7 +62,7 @@ def smooth(
     chain: Chain,
     guess: MotionState,
     *,
-    max_iterations: int,
+    max_iterations: int | Int32[Array, ""],
     tolerance: Float[Array, ""],
 ) -> Smoothed:
     """Return the states that agree best with all measurements of a chain.
