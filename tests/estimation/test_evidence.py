@@ -6,11 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.estimation.evidence import log_evidence
 from lio_jax.estimation.iterated_filter import CONVERGED
 from lio_jax.estimation.sliding_window import Added, append_and_update, open_window
 from tests.estimation.linear_chain import GRAVITY, linear_chain, log_likelihood, row_of
-from tests.estimation.smoothing import ROWS, smoothed
+from tests.estimation.smoothing import ROWS, evidence_of, smoothed
 from tests.imu.motion import quick_jit
 
 CAPACITY = 4
@@ -39,7 +38,7 @@ def test_it_is_the_density_of_the_measurements(linear):
     chain, positions, result = linear
     assert result.status == CONVERGED
     expected = log_likelihood(chain, positions)
-    assert float(log_evidence(chain, result)) == pytest.approx(expected, rel=1e-8)
+    assert float(evidence_of(chain, result)) == pytest.approx(expected, rel=1e-8)
 
 
 def test_a_window_that_forgot_knows_as_much_as_the_whole_chain(linear, along):
@@ -60,7 +59,7 @@ def test_the_evidence_of_what_was_forgotten_is_kept(linear, along):
     for count, (window, result) in enumerate(along, start=2):
         part = eqx.tree_at(lambda c: c.count, chain, jnp.int32(count))
         expected = log_likelihood(part, positions[:count])
-        assert float(log_evidence(window.chain, result)) == pytest.approx(expected, rel=1e-8)
+        assert float(evidence_of(window.chain, result)) == pytest.approx(expected, rel=1e-8)
 
 
 def test_the_window_fills_before_it_forgets(along):
