@@ -34,7 +34,9 @@ def test_solution_determinant_and_inverse_are_the_dense_ones(seed):
     assert np.linalg.eigvalsh(full).min() > 0
     right = np.random.default_rng(9).normal(size=(COUNT, SIZE))
     factor = factorise(matrix)
-    np.testing.assert_allclose(solve(factor, jnp.asarray(right)).ravel(), np.linalg.solve(full, right.ravel()), rtol=1e-10)
+    np.testing.assert_allclose(
+        solve(factor, jnp.asarray(right)).ravel(), np.linalg.solve(full, right.ravel()), rtol=1e-10
+    )
     assert float(log_determinant(matrix)) == pytest.approx(np.linalg.slogdet(full)[1], rel=1e-12)
     inverse = np.linalg.inv(full).reshape(COUNT, SIZE, COUNT, SIZE)
     found = inverse_blocks(factor)

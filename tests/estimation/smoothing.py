@@ -15,7 +15,9 @@ ROWS = 12
 
 @quick_jit
 def smoothed(chain: Chain, guess: MotionState, tolerance: float = 1e-9, at_most: int = 40) -> Smoothed:
-    return smooth(chain, guess, max_iterations=jnp.asarray(at_most, jnp.int32), tolerance=jnp.asarray(tolerance))
+    return smooth(
+        chain, guess, max_iterations=jnp.asarray(at_most, jnp.int32), tolerance=jnp.asarray(tolerance)
+    )
 
 
 evidence_of = quick_jit(log_evidence)

@@ -92,7 +92,9 @@ def test_a_prediction_has_no_residual_and_its_errors_have_the_covariance() -> No
     recording = simulate(0, 2001, params=fast)
     truth, links = recording.truth, rows(recording.chain.imu, slice(None, -1))
     link, start = rows(links, 7), rows(truth, 7)
-    np.testing.assert_allclose(imu_residual(link, GRAVITY, start, predicted(link, GRAVITY, start))[0], 0, atol=1e-12)
+    np.testing.assert_allclose(
+        imu_residual(link, GRAVITY, start, predicted(link, GRAVITY, start))[0], 0, atol=1e-12
+    )
 
     @quick_jit
     def whitened(links, start, end):
@@ -116,4 +118,6 @@ def test_shares_of_the_noise_add_up() -> None:
     np.testing.assert_array_equal(apart[:, :9, 9:], 0)
     np.testing.assert_allclose(apart[:, 9:, 9:], covariance[:, 9:, 9:], rtol=1e-9)
     # slightly less without the walk's part in the motion
-    assert np.all(np.diagonal(apart, axis1=1, axis2=2)[:, :9] < np.diagonal(covariance, axis1=1, axis2=2)[:, :9])
+    assert np.all(
+        np.diagonal(apart, axis1=1, axis2=2)[:, :9] < np.diagonal(covariance, axis1=1, axis2=2)[:, :9]
+    )

@@ -35,8 +35,8 @@ def in_sigmas(result, others) -> float:
 def test_the_same_factors_give_gtsams_states_and_covariances():
     """With biases that equal those of the preintegration, where gtsam's first-order correction is ours."""
     gtsam = pytest.importorskip("gtsam")
-    from gtsam_chain import GtsamChain, covariance_of, states_of
     from gtsam.symbol_shorthand import X
+    from gtsam_chain import GtsamChain, covariance_of, states_of
 
     recording = simulate(3, ROWS, extras=True)
     for _ in range(3):
@@ -60,7 +60,9 @@ def test_the_same_factors_give_gtsams_states_and_covariances():
     for k in (0, 5, ROWS - 1):
         expected = covariance_of(marginals, values.atPose3(X(k)), k)
         sigma = np.sqrt(np.diag(expected))
-        np.testing.assert_allclose(covariances[k] / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-8)
+        np.testing.assert_allclose(
+            covariances[k] / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-8
+        )
 
 
 def test_it_is_at_rest_where_it_ends_and_forgets_where_it_began(recording, solution):
@@ -92,7 +94,9 @@ def test_a_recording_shorter_than_the_rows(recording):
     a, b = smoothed(chain, short.guess), smoothed(wild, short.guess)
     assert a.status == b.status == CONVERGED
     np.testing.assert_array_equal(a.states.velocity[:count], b.states.velocity[:count])
-    np.testing.assert_array_equal(a.covariances()[count:], np.broadcast_to(np.eye(15), (ROWS - count, 15, 15)))
+    np.testing.assert_array_equal(
+        a.covariances()[count:], np.broadcast_to(np.eye(15), (ROWS - count, 15, 15))
+    )
     np.testing.assert_array_equal(a.normal.weights.lidar[count:], 0)
     unmasked = eqx.tree_at(lambda c: c.lidar.mask, short.chain, short.chain.lidar.mask.at[count:].set(False))
     longer = smoothed(unmasked, short.guess)
@@ -113,7 +117,9 @@ def test_an_outlier_is_weighed_down_and_reported(recording, solution):
     assert weights[5] < 1e-3
     assert np.delete(weights, 5).min() > 0.5
     assert in_sigmas(result, solution.states) < 1.5
-    trusting = smoothed(eqx.tree_at(lambda c: c.lidar.kernel, chain, jnp.full(ROWS, jnp.inf)), recording.guess)
+    trusting = smoothed(
+        eqx.tree_at(lambda c: c.lidar.kernel, chain, jnp.full(ROWS, jnp.inf)), recording.guess
+    )
     assert in_sigmas(trusting, solution.states) > 10
 
 
@@ -158,7 +164,9 @@ def test_a_degenerate_frame_is_carried_by_the_others(recording, solution):
     along_x = jnp.diag(jnp.array([1.0, 1, 1, 0, 1, 1])) * recording.chain.lidar.information[5]
     for information in (loose, along_x):
         changed = recording.chain.lidar.information.at[5].set(information)
-        result = smoothed(eqx.tree_at(lambda c: c.lidar.information, recording.chain, changed), recording.guess)
+        result = smoothed(
+            eqx.tree_at(lambda c: c.lidar.information, recording.chain, changed), recording.guess
+        )
         assert result.status == CONVERGED
         before, after = (s.covariances()[5, 3, 3] for s in (solution, result))
         assert before < after < 9 * before
@@ -199,7 +207,9 @@ def test_optimistix_finds_the_same(recording, solution):
             root(chain.prior.information) @ first,
         )
 
-    solver = optimistix.LevenbergMarquardt(rtol=1e-12, atol=1e-12, linear_solver=lineax.Normal(lineax.Cholesky()))
+    solver = optimistix.LevenbergMarquardt(
+        rtol=1e-12, atol=1e-12, linear_solver=lineax.Normal(lineax.Cholesky())
+    )
     found = optimistix.least_squares(residuals, solver, jnp.zeros(15 * size), max_steps=100)
     chain = eqx.tree_at(lambda c: c.count, recording.chain, jnp.int32(size))
     mine = smoothed(chain, recording.guess)

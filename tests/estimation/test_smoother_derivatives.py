@@ -11,28 +11,44 @@ from lio_jax.core.params import ImuParams
 from lio_jax.estimation.evidence import log_evidence
 from lio_jax.estimation.iterated_filter import CONVERGED
 from lio_jax.estimation.smoother import smooth
-from tests.estimation.smoothing import ROWS  # noqa: F401
+from tests.experiments import bench_path  # noqa: F401
 from tests.imu.motion import quick_jit
 
 from simulated_chain import GRAVITY, simulate  # isort: skip
 
 COUNT = 5
-INPUTS = ("gyro noise", "accel noise", "gyro walk", "accel walk", "lidar", "gps", "x", "yaw", "gps x", "gravity", "kernel")
+INPUTS = (
+    "gyro noise",
+    "accel noise",
+    "gyro walk",
+    "accel walk",
+    "lidar",
+    "gps",
+    "x",
+    "yaw",
+    "gps x",
+    "gravity",
+    "kernel",
+)
 
 
 @pytest.fixture(scope="module")
 def recording():
-    return simulate(1, COUNT, extras=True)
+    found = simulate(1, COUNT, extras=True)
+    # relative poses are left out: they would only make the program longer
+    return eqx.tree_at(lambda r: r.chain.relative, found, None)
 
 
 def results(x, recording):
     """Return evidence, a position, a velocity and a bias as functions of log-noise and measurements."""
     chain = recording.chain
-    densities = jnp.exp(x[:4]) * jnp.array([2e-3, 2e-2, 2e-4, 2e-3])
+    densities = jnp.exp(x[:4]) * jnp.array([2e-3, 2e-2, 2e-2, 0.2])
     pose = chain.lidar.T_world_imu
     turn = jaxlie.SO3.exp(jnp.zeros(3).at[2].set(x[7])).wxyz
     moved = jaxlie.SE3.from_rotation_and_translation(
-        jaxlie.SO3(pose.wxyz_xyz[:, :4].at[2].set((jaxlie.SO3(turn) @ jaxlie.SO3(pose.wxyz_xyz[2, :4])).wxyz)),
+        jaxlie.SO3(
+            pose.wxyz_xyz[:, :4].at[2].set((jaxlie.SO3(turn) @ jaxlie.SO3(pose.wxyz_xyz[2, :4])).wxyz)
+        ),
         pose.translation().at[2, 0].add(x[6]),
     )
     chain = eqx.tree_at(
@@ -72,16 +88,15 @@ def test_they_are_central_differences(recording):
     origin = jnp.zeros(len(INPUTS))
     assert value(origin, recording)[1] == CONVERGED
     slopes = quick_jit(jax.jacrev(lambda x: results(x, recording)[0]))(origin)
-    # of fourth order, with steps that suit a logarithm, and a metre where measurements are linear
-    step = 3e-3
+    # of fourth order
+    step = 5e-3
 
     def difference(axis):
         at = lambda share: value(share * step * axis, recording)[0]  # noqa: E731
         return (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)
 
     expected = np.stack([difference(axis) for axis in jnp.eye(len(INPUTS))], axis=1)
-    # bias walks hardly matter within half a second: their slopes are 1e-5 of the others'
-    scale = np.maximum(np.abs(expected), 1e-5 * np.abs(expected).max(axis=1, keepdims=True))
+    scale = np.maximum(np.abs(expected), 1e-4 * np.abs(expected).max(axis=1, keepdims=True))
     error = np.abs(slopes - expected) / scale
     assert error.max() < 1e-4, dict(zip(INPUTS, error.T, strict=True))
     assert np.all(np.abs(expected[:, [0, 1, 4, 6, 7, 9]]) > 0)
