@@ -88,14 +88,15 @@ def test_they_are_central_differences(recording):
     origin = jnp.zeros(len(INPUTS))
     assert value(origin, recording)[1] == CONVERGED
     slopes = quick_jit(jax.jacrev(lambda x: results(x, recording)[0]))(origin)
-    # of fourth order
-    step = 5e-3
+    # of fourth order; a fraction of a sigma where the kernel bends the cost
+    steps = np.full(len(INPUTS), 5e-3)
+    steps[[6, 7]] = 5e-4, 1e-4
 
-    def difference(axis):
+    def difference(axis, step):
         at = lambda share: value(share * step * axis, recording)[0]  # noqa: E731
         return (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)
 
-    expected = np.stack([difference(axis) for axis in jnp.eye(len(INPUTS))], axis=1)
+    expected = np.stack([difference(*pair) for pair in zip(jnp.eye(len(INPUTS)), steps, strict=True)], axis=1)
     scale = np.maximum(np.abs(expected), 1e-4 * np.abs(expected).max(axis=1, keepdims=True))
     error = np.abs(slopes - expected) / scale
     assert error.max() < 1e-4, dict(zip(INPUTS, error.T, strict=True))
