@@ -3,9 +3,8 @@
 The normal equations of a chain of states, each linked to the next one, are of this form; eliminating the
 states in their order is sparse Cholesky without fill-in (Dellaert & Kaess, "Square Root SAM", IJRR 2006). One
 step of the scan costs 4 us with 15 x 15 blocks in float64 on a CPU core, less than the batched products that
-make the blocks: cyclic reduction would have twice the arithmetic. The functions are jitted because a scan that is
-called
-on its own would be compiled each time.
+make the blocks: cyclic reduction would have twice the arithmetic. The functions are jitted because a scan
+that is called on its own would be compiled each time.
 """
 
 import equinox as eqx
