@@ -96,14 +96,16 @@ def simulate(seed, count: int, params: ImuParams = IMU, extras: bool = False) ->
         jaxlie.SE3.exp(jnp.array([1.0, 2, 3, 0.1, -0.2, 0.8])), jnp.array([1.0, 0.5, 0]), *jnp.zeros((2, 3))
     )
     force = jax.lax.scan(turn, first.T_world_imu.rotation(), (rate, acceleration))[1]
-    duration = jnp.full((links, PER_LINK), STEP)
 
     def intervals_of(gyro, accel) -> Intervals:
-        known = jnp.ones((links, PER_LINK), bool)
         shape = (links, PER_LINK, 3)
-        return Intervals(
-            duration, gyro.reshape(shape), accel.reshape(shape), 0 * duration, known, jnp.ones(links, bool)
-        )
+        every = jnp.full(PER_LINK, STEP)
+
+        def intervals(gyro, accel) -> Intervals:
+            known = jnp.ones(PER_LINK, bool)
+            return Intervals(every, gyro, accel, jnp.zeros_like(every), known, jnp.array(True))
+
+        return jax.vmap(intervals)(gyro.reshape(shape), accel.reshape(shape))
 
     zero = jnp.zeros((links, 3))
     truth = along(first, links_of(intervals_of(rate, force), zero, zero, params))

@@ -3,7 +3,8 @@
 The normal equations of a chain of states, each linked to the next one, are of this form; eliminating the
 states in their order is sparse Cholesky without fill-in (Dellaert & Kaess, "Square Root SAM", IJRR 2006). One
 step of the scan costs 4 us with 15 x 15 blocks in float64 on a CPU core, less than the batched products that
-make the blocks: cyclic reduction would have twice the arithmetic.
+make the blocks: cyclic reduction would have twice the arithmetic. The functions are jitted because a scan
+that is called on its own would be compiled each time.
 """
 
 import equinox as eqx
@@ -31,6 +32,7 @@ class Factored(eqx.Module):
     """U_k = L_k^-1 C_k', C_k the coupling with the next block; zero in the last row."""
 
 
+@jax.jit
 def factorise(matrix: BlockTridiagonal) -> Factored:
     """Return the Cholesky factor, not a number from the first block on that is not positive definite."""
     last = jnp.zeros_like(matrix.diagonal[:1])
@@ -45,6 +47,7 @@ def factorise(matrix: BlockTridiagonal) -> Factored:
     return Factored(*jax.lax.scan(eliminate, last[0], (matrix.diagonal, following))[1])
 
 
+@jax.jit
 def solve(factor: Factored, right: Float[Array, "n d"]) -> Float[Array, "n d"]:
     """Return the inverse of the matrix times ``right``."""
 
@@ -64,6 +67,7 @@ def solve(factor: Factored, right: Float[Array, "n d"]) -> Float[Array, "n d"]:
     return jax.lax.scan(backward, nothing, (*rows, found), reverse=True)[1]
 
 
+@jax.jit
 def inverse_blocks(factor: Factored) -> BlockTridiagonal:
     """Return those blocks of the inverse that lie where the matrix has its own: the others are dense.
 

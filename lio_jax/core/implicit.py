@@ -43,9 +43,9 @@ class Problem(eqx.Module):
     """``(root, inputs) -> B (d, k), C (k, d)``: the probe feels a step dx of the root as it would B C dx, so
     that k of its derivatives will do. None: the identity."""
     inverse_slope: Callable[[Array, Any, Any, Array], Array] | None = None
-    """``(root, selection, inputs, right) -> (dr/dx)^-1 right`` for a symmetric dr/dx whose structure makes this
-    cheaper than a dense factorisation, such as that of a chain. It is taken as constant: this derivative has
-    none of its own."""
+    """``(root, selection, inputs, right) -> (dr/dx)^-1 right`` for a symmetric dr/dx whose structure makes
+    this cheaper than a dense factorisation, such as that of a chain. It is taken as constant: the derivative
+    has none of its own."""
 
 
 def implicit(problem: Problem, inputs: Any) -> Solution:

@@ -1,1 +1,1 @@
-"""Estimation: the iterated error-state filter and its measurements."""
+"""Estimation: the iterated error-state filter and its measurements, and the smoother of a chain of states."""

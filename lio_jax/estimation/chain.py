@@ -18,7 +18,7 @@ from lio_jax.imu.preintegration import Preintegrated
 
 
 class Chain(eqx.Module):
-    """Measurements in arrays of n rows, one a state; those between two states stand in the row of the first."""
+    """Measurements in arrays of n rows, one a state; those of two states stand in the row of the first."""
 
     count: Int32[Array, ""]
     """States there are: those behind are padding, and so are the rows that lead to them."""
@@ -27,7 +27,7 @@ class Chain(eqx.Module):
     prior: Prior
     """Of the first state."""
     imu: Preintegrated
-    """To the next state; the last row leads nowhere. Without samples (``measured``) its covariance is wide."""
+    """To the next state; the last row leads nowhere. What has no samples has a wide covariance."""
     lidar: PoseMeasurement
     relative: RelativePose | None = None
     gps: PositionMeasurement | None = None
@@ -84,7 +84,9 @@ def linearise(
     start = jax.tree.map(lambda rows: rows[:-1], states)
     end = jax.tree.map(lambda rows: rows[1:], states)
 
-    def over(quadratic: Callable[..., Quadratic], dof: int, there: Array, row: Any, *of: MotionState) -> Quadratic:
+    def over(
+        quadratic: Callable[..., Quadratic], dof: int, there: Array, row: Any, *of: MotionState
+    ) -> Quadratic:
         terms = jax.vmap(_to_second_order(quadratic, dof) if exact else quadratic)(row, *of)
         return jax.tree.map(lambda leaf: jnp.where(_column(there, leaf), leaf, 0.0), terms)
 
@@ -108,7 +110,7 @@ def linearise(
         matrix=matrix,
         gradient=gradient,
         cost=sum((jnp.sum(term.cost) for term in unary + binary), jnp.zeros((), gradient.dtype)),
-        weights=Weights(lidar.weight, relative and relative.weight, gps and gps.weight),
+        weights=Weights(lidar.weight, relative.weight if relative else None, gps.weight if gps else None),
     )
 
 
@@ -136,7 +138,8 @@ def _assembled(
 
 
 def _link_quadratic(link: tuple, start: MotionState, end: MotionState) -> Quadratic:
-    return imu_quadratic(*link, start, end)
+    measured, gravity, information = link
+    return imu_quadratic(measured, gravity, information, start, end)
 
 
 def _to_second_order(quadratic: Callable[..., Quadratic], dof: int) -> Callable[..., Quadratic]:

@@ -112,4 +112,6 @@ def imu_residual(
         ],
         axis=1,
     )
-    return residual, jnp.concatenate([motion, jnp.eye(6, 30, 9, dtype=dtype) - jnp.eye(6, 30, 24, dtype=dtype)])
+    return residual, jnp.concatenate(
+        [motion, jnp.eye(6, 30, 9, dtype=dtype) - jnp.eye(6, 30, 24, dtype=dtype)]
+    )

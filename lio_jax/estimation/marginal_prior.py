@@ -12,7 +12,7 @@ LOG_2PI = 1.8378770664093453
 
 
 class Prior(eqx.Module):
-    """A density of a state's error e from an origin: log p = log_scale - e' information e / 2 - gradient' e."""
+    """A log-density of a state's error e from an origin: log_scale - e' information e / 2 - gradient' e."""
 
     origin: MotionState
     information: Float[Array, "15 15"]

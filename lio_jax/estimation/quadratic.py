@@ -22,7 +22,7 @@ def quadratic(
     information: Float[Array, "m m"],
     weight: Float[Array, ""],
 ) -> Quadratic:
-    """Return half the squared norm of a residual with information A: r'A r / 2, J'A r, J'A J, times weight."""
+    """Return half the squared norm of a residual with information A: r'Ar / 2, J'Ar, J'AJ, times weight."""
     scaled = information @ residual
     return Quadratic(
         cost=weight * jnp.dot(residual, scaled) / 2,

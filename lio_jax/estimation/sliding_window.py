@@ -51,8 +51,8 @@ def open_window(capacity: int, prior: Prior, gravity: Float[Array, "3"], first: 
         capacity: states it has room for, at least two.
         prior: of the first state.
         gravity: in world, m/s^2.
-        first: measurements of the first state; ``link`` and ``relative`` only say what is to come: all windows
-            that follow have relative poses and GPS where these have.
+        first: measurements of the first state; whether it has relative poses and GPS says whether the window
+            will have them. ``link`` and ``relative`` lead to no state yet and are not used otherwise.
     """
     padding = Added(
         link=still_link(prior.gradient.dtype),
@@ -86,7 +86,7 @@ def append(window: Window, added: Added) -> Window:
 
 
 def update(window: Window, *, max_iterations: int, tolerance: Float[Array, ""]) -> tuple[Window, Smoothed]:
-    """Return the window with its states smoothed, and the smoother's result; arguments as of :func:`smooth`."""
+    """Return the window with its states smoothed, and the result; arguments as of :func:`smooth`."""
     smoothed = smooth(window.chain, window.states, max_iterations=max_iterations, tolerance=tolerance)
     return Window(window.chain, smoothed.states), smoothed
 

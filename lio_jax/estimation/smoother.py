@@ -58,6 +58,15 @@ class _Loop(NamedTuple):
     done: Bool[Array, ""]
 
 
+class _Found(NamedTuple):
+    """What the derivative takes for constant."""
+
+    states: MotionState
+    decrement: Float[Array, ""]
+    iterations: Int32[Array, ""]
+    done: Bool[Array, ""]
+
+
 def smooth(
     chain: Chain,
     guess: MotionState,
@@ -78,18 +87,18 @@ def smooth(
         tolerance: converged when the next step would be shorter than this, sigmas.
     """
     problem = Problem(_solve, _no_probe, _gradient, _report, inverse_slope=_inverse_hessian)
-    found = implicit(problem, (chain, guess, tolerance, max_iterations))
-    states, normal = found.reported
-    loop = found.selection
-    finite = jnp.isfinite(normal.cost) & jnp.isfinite(loop.decrement)
-    status = jnp.where(loop.done, CONVERGED, jnp.where(finite, ITERATION_LIMIT, NOT_FINITE))
+    solution = implicit(problem, (chain, guess, tolerance, max_iterations))
+    states, normal = solution.reported
+    found: _Found = solution.selection
+    finite = jnp.isfinite(normal.cost) & jnp.isfinite(found.decrement)
+    status = jnp.where(found.done, CONVERGED, jnp.where(finite, ITERATION_LIMIT, NOT_FINITE))
     linked = chain.present()[1:]
     return Smoothed(
         states=states,
         normal=normal,
         status=status.astype(jnp.int32),
-        iterations=loop.iterations,
-        decrement=loop.decrement,
+        iterations=found.iterations,
+        decrement=found.decrement,
         unmeasured=jnp.sum(linked & ~chain.imu.measured[:-1]).astype(jnp.int32),
     )
 
@@ -134,7 +143,8 @@ def _solve(inputs: Any) -> Solution:
     start = _Loop(guess, guess, blank, zero, zero, jnp.int32(0), jnp.array(False))
     loop = jax.lax.while_loop(unfinished, iterate, start)
     root = jnp.zeros(blank.gradient.size, blank.gradient.dtype)
-    return Solution(root, loop._replace(normal=None, trial=None), (loop.states, loop.normal))
+    kept = _Found(loop.states, loop.decrement, loop.iterations, loop.done)
+    return Solution(root, kept, (loop.states, loop.normal))
 
 
 def _damped(matrix: BlockTridiagonal, damping: Array) -> BlockTridiagonal:
@@ -143,22 +153,22 @@ def _damped(matrix: BlockTridiagonal, damping: Array) -> BlockTridiagonal:
     return BlockTridiagonal(matrix.diagonal * scale, matrix.coupling)
 
 
-def _no_probe(error: Array, loop: _Loop, inputs: Any) -> None:
+def _no_probe(error: Array, found: _Found, inputs: Any) -> None:
     return None
 
 
-def _gradient(error: Array, probed: None, loop: _Loop, inputs: Any) -> Array:
+def _gradient(error: Array, probed: None, found: _Found, inputs: Any) -> Array:
     """Return the gradient at the states that ``error`` leads to from the solution: zero at zero."""
-    return _report(error, probed, loop, inputs)[1].gradient.ravel()
+    return _report(error, probed, found, inputs)[1].gradient.ravel()
 
 
-def _report(error: Array, probed: None, loop: _Loop, inputs: Any) -> tuple[MotionState, Normal]:
+def _report(error: Array, probed: None, found: _Found, inputs: Any) -> tuple[MotionState, Normal]:
     chain = inputs[0]
-    states = loop.states.retract(error.reshape(-1, DOF))
+    states = found.states.retract(error.reshape(-1, DOF))
     return states, linearise(chain, information_of(chain), states)
 
 
-def _inverse_hessian(error: Array, loop: _Loop, inputs: Any, right: Array) -> Array:
+def _inverse_hessian(error: Array, found: _Found, inputs: Any, right: Array) -> Array:
     chain = inputs[0]
-    exact = linearise(chain, information_of(chain), loop.states, exact=True)
+    exact = linearise(chain, information_of(chain), found.states, exact=True)
     return solve(factorise(exact.matrix), right.reshape(-1, DOF)).ravel()

@@ -46,7 +46,8 @@ def noise_shares(
     """
 
     def covariance(densities: Float[Array, "4"]) -> Float[Array, "15 15"]:
-        params = ImuParams(*densities, gravity=jnp.zeros_like(densities[0]))
+        gyro, accel, gyro_walk, accel_walk = densities
+        params = ImuParams(gyro, accel, gyro_walk, accel_walk, gravity=jnp.zeros_like(gyro))
         return preintegrate_parallel(intervals, gyro_bias, accel_bias, params, turning).covariance
 
     # the motion is the same for all five: under vmap only the last product is repeated

@@ -91,3 +91,32 @@ def test_a_known_value_takes_the_derivative_of_its_formula():
     value, slope = jax.value_and_grad(lambda x: known(jnp.array(7.0), jnp.sin, x))(jnp.array(0.3))
     assert float(value) == 7.0
     assert float(slope) == pytest.approx(np.cos(0.3))
+
+
+def test_a_structured_inverse_of_the_slope_gives_the_same_derivative_in_both_modes():
+    """x + a tanh(x) = b, whose slope is diagonal; without the probe's derivatives one by one."""
+
+    def solved(inputs):
+        a, b = inputs
+        step = lambda _, x: x - (x + a * jnp.tanh(x) - b) / (1 + a / jnp.cosh(x) ** 2)  # noqa: E731
+        x = jax.lax.fori_loop(0, 30, step, b)
+        return Solution(x, None, jnp.sum(jnp.tanh(x)))
+
+    def problem(inverse_slope):
+        return Problem(
+            solved,
+            lambda x, _, inputs: jnp.tanh(x),
+            lambda x, probed, _, inputs: x + inputs[0] * probed - inputs[1],
+            lambda x, probed, _, inputs: jnp.sum(probed),
+            inverse_slope=inverse_slope,
+        )
+
+    def diagonal(x, _, inputs, right):
+        return right / (1 + inputs[0] / jnp.cosh(x) ** 2)
+
+    def values(problem):
+        return lambda a: jnp.append(*implicit(problem, (a, B))[::2])
+
+    expected = jax.jacfwd(values(problem(None)))(A)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(values(problem(diagonal)))(A), expected, rtol=1e-12)
