@@ -23,6 +23,7 @@ from lio_jax.core.error_state import DOF as NAV_DOF
 from lio_jax.core.errors import UsageError
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan
+from lio_jax.estimation.evidence import log_evidence
 from lio_jax.estimation.motion_state import DOF
 from lio_jax.estimation.sliding_window import Added, Window, append_and_update
 from lio_jax.estimation.smoother import Smoothed
@@ -122,7 +123,9 @@ def moving_as(fresh: State, found: State) -> State:
         window = state.window
         return state.nav.velocity, window.states.velocity, window.chain.prior.origin.velocity
 
-    return eqx.tree_at(places, fresh, (velocity, jnp.broadcast_to(velocity, rows.shape), velocity))
+    return eqx.tree_at(
+        places, fresh, (velocity, jnp.broadcast_to(velocity[..., None, :], rows.shape), velocity)
+    )
 
 
 def step(
@@ -222,6 +225,7 @@ def step(
         thinned_away=thinned_away + features.dropped,
         map_dropped=added[0].dropped + added[1].dropped,
         covariance=_covariance(smoothed, window),
+        log_evidence=log_evidence(window.chain, smoothed),
     )
 
 

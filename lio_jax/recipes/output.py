@@ -48,3 +48,5 @@ class Output(eqx.Module):
     """Of the navigation state's error; None from recipes that carry none."""
     evidence: Evidence | None = None
     """None from recipes that carry no covariance."""
+    log_evidence: Float[Array, ""] | None = None
+    """Log marginal likelihood of all measurements so far; None from recipes without a smoother."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from lio_jax.core.errors import UsageError
 from lio_jax.tuning.objective import Objective
 from lio_jax.tuning.objectives import (
+    MarginalLikelihood,
     MeanOverScans,
     WeightedSum,
     map_consistency,
@@ -30,6 +31,7 @@ _OPENING = 10
 _SINGLE = {
     "pose": Named(MeanOverScans(pose_innovation, _OPENING), False, True),
     "point": Named(MeanOverScans(point_innovation, _OPENING), False, True),
+    "marginal": Named(MarginalLikelihood(_OPENING), False, True),
     "planes": Named(MeanOverScans(plane_thickness, _OPENING), False, True),
     "map": Named(MeanOverScans(map_consistency), False, False),
     "ate": Named(AbsoluteError(), True, False),

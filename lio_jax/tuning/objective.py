@@ -32,13 +32,21 @@ class Observed(eqx.Module):
     """Of the navigation state; None from recipes that carry none."""
     evidence: Evidence | None
     """How well the scan was foretold; None from recipes that carry no covariance."""
+    log_evidence: Float[Array, ""] | None
+    """Of all measurements so far; None from recipes without a smoother."""
 
     @staticmethod
     def of(state: Any, output: Any) -> "Observed":
         """Return what a recipe's step leaves to see."""
         result = output.registration
         return Observed(
-            state.nav, result.rmse, result.status, output.lost, output.covariance, output.evidence
+            nav=state.nav,
+            rmse=result.rmse,
+            status=result.status,
+            lost=output.lost,
+            covariance=output.covariance,
+            evidence=output.evidence,
+            log_evidence=output.log_evidence,
         )
 
 

@@ -37,6 +37,32 @@ class MeanOverScans(eqx.Module):
         return sums[0] / jnp.maximum(sums[1], 1.0)
 
 
+class MarginalLikelihood(eqx.Module):
+    """The negative log marginal likelihood of a recording's measurements per scan, by a smoother.
+
+    It asks how probable the inertial samples and the scan matches are whatever the states, and so does not
+    book an error of one scan match on the inertial samples as innovations do.
+    """
+
+    skip: int = eqx.field(static=True, default=0)
+    """Scans at the start whose measurements do not count."""
+
+    def start(self) -> Float[Array, "3"]:
+        """Return the log-likelihood of all scans, that of those skipped, and the scans seen."""
+        return jnp.zeros(3, state_dtype())
+
+    def add(self, sums: Float[Array, "3"], seen: Observed, truth: TruePose) -> Float[Array, "3"]:
+        """Add a scan."""
+        if seen.log_evidence is None:
+            raise UsageError("the recipe has no smoother and no marginal likelihood; use lio_sam, or pose.")
+        total = seen.log_evidence
+        return jnp.stack([total, jnp.where(sums[2] < self.skip, total, sums[1]), sums[2] + 1])
+
+    def value(self, sums: Float[Array, "3"]) -> Float[Array, ""]:
+        """Return the mean."""
+        return (sums[1] - sums[0]) / jnp.maximum(sums[2] - self.skip, 1.0)
+
+
 class WeightedSum(eqx.Module):
     """A sum of objectives."""
 

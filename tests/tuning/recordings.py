@@ -23,11 +23,17 @@ SMALL = [
     "config.imu.registration_points=1024",
     "config.imu.insertion_points=4096",
     "config.map.capacity=32768",
+    "config.lio_sam.window=4",
+    "config.lio_sam.keyframes=8",
+    "config.lio_sam.corner_points=512",
+    "config.lio_sam.surface_points=1024",
 ]
 TIGHT = [
     "config.registration.max_iterations=60",
     "params.registration.rotation_tolerance=1e-12",
     "params.registration.translation_tolerance=1e-12",
+    "config.lio_sam.smoother_iterations=30",
+    "params.smoother.tolerance=1e-10",
 ]
 
 
