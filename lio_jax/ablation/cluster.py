@@ -1,18 +1,19 @@
 """Where the runs are made: workers on this machine, or a dask cluster that runs already."""
 
+import asyncio
 import importlib.util
 import logging
 import os
 import subprocess
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from lio_jax.core.errors import LioJaxError, UsageError
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Nanny, SpecCluster
 
 _WORKER_BYTES = 2 << 30
 """Memory that a worker is given room for."""
@@ -29,50 +30,110 @@ class Workers:
     count: int
     deaths_allowed: int
     """How often a run may take its worker down before it counts as failed."""
+    revive: Callable[[], None] = lambda: None
+    """Replaces workers that are gone for good."""
 
 
 @contextmanager
 def on_this_machine(most: int) -> Iterator[Workers]:
     """Start workers for the block: one per GPU, else one per core as far as memory reaches.
 
-    All of it listens on the loopback interface alone, without a dashboard.
+    All of it listens on the loopback interface alone.
 
     Args:
         most: of the workers that have something to do.
     """
     _check_installed()
     import dask
-    from distributed import Client, Nanny, Scheduler, SpecCluster
+    from distributed import Client, Scheduler, SpecCluster
 
     gpus = visible_gpus()
     count = max(1, min(most, len(gpus) or _cores_with_memory()))
-    # a run that takes its worker down is counted here, run by run, not by dask, group by group
+    environments = [_environment(gpus[number] if gpus else None) for number in range(count)]
     settings = {
+        # a run that takes its worker down is counted here, run by run, not by dask, group by group
         "distributed.scheduler.allowed-failures": 0,
         "distributed.logging.distributed": "critical",
-        "distributed.admin.low-level-log-length": 0,
     }
-    quiet = logging.CRITICAL
-    with dask.config.set(settings), ExitStack() as stack:
-        workers = {
-            number: {
-                "cls": Nanny,
-                "options": {
-                    "nthreads": 1,
-                    "memory_limit": 0,
-                    "dashboard": False,
-                    "host": "127.0.0.1",
-                    "silence_logs": quiet,
-                    "preload": ["lio_jax.ablation.worker_process"],
-                    "env": _environment(gpus[number] if gpus else None),
-                },
-            }
-            for number in range(count)
+    options = {"dashboard_address": "127.0.0.1:0", "host": "127.0.0.1", "port": 0}
+    with (
+        dask.config.set(settings),
+        SpecCluster({}, {"cls": Scheduler, "options": options}, silence_logs=logging.CRITICAL) as cluster,
+        Crew(cluster, environments) as crew,
+        Client(cluster) as client,
+    ):
+        yield Workers(client, count, deaths_allowed=3, revive=crew.revive)
+
+
+class Crew:
+    """Worker processes of this machine, each kept alive by a dask nanny, and the nannies by this class.
+
+    A nanny starts a worker that died anew, but gives up where it dies again while it starts.
+    """
+
+    def __init__(self, cluster: "SpecCluster", environments: Sequence[dict[str, str]]) -> None:
+        self._cluster = cluster
+        self._environments = environments
+        self._nannies: dict[int, Nanny] = {}
+        self._failed_starts = 0
+
+    def __enter__(self) -> "Crew":
+        self.revive()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._cluster.sync(self._close)
+
+    def revive(self) -> None:
+        """Start what is not there.
+
+        Raises:
+            LioJaxError: time and again it did not start.
+        """
+        self._cluster.sync(self._start)
+
+    async def _start(self) -> None:
+        from distributed import Nanny, Status
+
+        gone = {
+            number
+            for number in range(len(self._environments))
+            if number not in self._nannies
+            or self._nannies[number].status in (Status.closed, Status.closing, Status.failed)
         }
-        scheduler = {"cls": Scheduler, "options": {"dashboard": False, "host": "127.0.0.1", "port": 0}}
-        cluster = stack.enter_context(SpecCluster(workers, scheduler, silence_logs=quiet))
-        client = stack.enter_context(Client(cluster))
-        yield Workers(client, count, deaths_allowed=3)
+        nannies = {
+            number: Nanny(
+                self._cluster.scheduler_address,
+                nthreads=1,
+                memory_limit=0,
+                dashboard=False,
+                host="127.0.0.1",
+                silence_logs=logging.CRITICAL,
+                preload=["lio_jax.ablation.worker_process"],
+                env=self._environments[number],
+            )
+            for number in gone
+        }
+        ended = await asyncio.gather(*(_started(nanny) for nanny in nannies.values()))
+        problems = [error for error in ended if error is not None]
+        self._nannies |= nannies
+        self._failed_starts = self._failed_starts + 1 if problems else 0
+        if self._failed_starts > _MOST_FAILED_STARTS:
+            raise LioJaxError(f"workers cannot be started on this machine ({problems[0]}).")
+
+    async def _close(self) -> None:
+        await asyncio.gather(*(nanny.close(timeout=1) for nanny in self._nannies.values()))
+
+
+async def _started(nanny: "Nanny") -> Exception | None:
+    try:
+        await nanny
+    except Exception as error:
+        return error
+    return None
+
+
+_MOST_FAILED_STARTS = 20
 
 
 @contextmanager

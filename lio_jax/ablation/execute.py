@@ -62,6 +62,7 @@ def execute(
             except TimeoutError:
                 finished = set()
             progress(len(store.done(keys)), len(store.failed(keys)))
+            workers.revive()
             for future in finished:
                 piece = waiting.pop(future)
                 if future.cancelled():

@@ -1,0 +1,62 @@
+"""An ablation whose runs take a moment and leave two files; also a command, to be killed."""
+
+import sys
+import time
+from pathlib import Path
+
+from lio_jax.ablation.cluster import on_this_machine
+from lio_jax.ablation.execute import execute
+from lio_jax.ablation.sources import Recorded
+from lio_jax.ablation.store import opened
+from lio_jax.ablation.tasks import Task
+from lio_jax.ablation.variants import Variant
+from lio_jax.core.settings import Settings
+
+RECORDINGS, VARIANTS = 4, 12
+TAKES_S = 0.06
+LINES = 200
+
+
+def tasks():
+    """Return runs of a few recordings, each of which is one piece of work."""
+    settings = Settings()
+    return [
+        Task(
+            Recorded(f"r{recording}", "none"),
+            Variant(f"v{variant}", {}, settings),
+            "trajectory",
+            None,
+            f"r{recording}v{variant:02d}",
+            f"r{recording}",
+        )
+        for recording in range(RECORDINGS)
+        for variant in range(VARIANTS)
+    ]
+
+
+def content(key):
+    return f"{key}\n" * LINES
+
+
+def nothing():
+    """Stand for what a worker needs before its first run."""
+
+
+def perform(pieces, store):
+    """Write two halves with a pause in between: a kill likely falls between them."""
+    for task in pieces:
+        if store.is_done(task.key):
+            continue
+        with store.result(task.key) as folder:
+            (folder / "first.txt").write_text(content(task.key))
+            time.sleep(TAKES_S)
+            (folder / "second.txt").write_text(content(task.key))
+
+
+def run(root, progress=lambda done, failed: None):
+    with opened(root) as store, on_this_machine(2) as workers:
+        execute(workers, store, tasks(), perform, nothing, progress)
+
+
+if __name__ == "__main__":
+    run(Path(sys.argv[1]))
