@@ -77,12 +77,14 @@ def _execute(store: Store, tasks: list[Task], left: int, scheduler: str) -> None
 
 def _conclude(spec: Spec, tasks: list[Task], store: Store, report: bool) -> None:
     comparison = compare(spec, tasks, store)
+    page = store.root / "report.html"
+    if report:
+        with disk_errors_said(page):
+            write_report(comparison, store)
     print(as_text(comparison))
     print(f"\nruns       {store.root / 'tasks'}")
     if report:
-        with disk_errors_said(store.root / "report.html"):
-            write_report(comparison, store)
-        print(f"report     {store.root / 'report.html'}")
+        print(f"report     {page}")
     failures = list(comparison.failures.values())
     for record in failures[:_REASONS_SHOWN]:
         say(f"failed: {record['run']}: {record['reason']}")

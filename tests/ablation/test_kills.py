@@ -1,5 +1,6 @@
 """SIGKILL of workers and of the whole command, at random moments: nothing is lost, nothing is half there."""
 
+import json
 import random
 import signal
 import subprocess
@@ -98,3 +99,13 @@ def test_commands_are_killed(tmp_path):
     assert {key: now[key] for key in before} == before
     check_all_done(root)
     assert kills == KILLS_OF_COMMANDS
+
+
+def test_a_run_that_takes_its_worker_down_each_time(tmp_path):
+    """Counts as failed after some tries; what comes after it is done."""
+    root = tmp_path / "out"
+    trivial.run(root, trivial.poisoned)
+    assert set(results(root)) == {task.key for task in trivial.tasks()} - {trivial.POISON}
+    (record,) = (root / "failed").iterdir()
+    assert record.stem == trivial.POISON
+    assert json.loads(record.read_text())["reason"].startswith("the worker process died each time")

@@ -1,5 +1,6 @@
 """An ablation whose runs take a moment and leave two files; also a command, to be killed."""
 
+import os
 import sys
 import time
 from pathlib import Path
@@ -53,9 +54,20 @@ def perform(pieces, store):
             (folder / "second.txt").write_text(content(task.key))
 
 
-def run(root, progress=lambda done, failed: None):
+POISON = "r1v03"
+
+
+def poisoned(pieces, store):
+    """Take the worker process down at one of the runs."""
+    for task in pieces:
+        if task.key == POISON:
+            os._exit(9)
+        perform((task,), store)
+
+
+def run(root, work=perform):
     with opened(root) as store, on_this_machine(2) as workers:
-        execute(workers, store, tasks(), perform, nothing, progress)
+        execute(workers, store, tasks(), work, nothing, lambda done, failed: None)
 
 
 if __name__ == "__main__":
