@@ -69,7 +69,7 @@ def test_smoke(cli, tmp_path):
     lines = done.out.splitlines()
     assert lines[0].split()[:3] == ["variant", "runs", "ate.rmse"]
     assert sum("4/4" in line for line in lines) == 4
-    assert sum("baseline" in line.split() for line in lines) == 1
+    assert sum(line.split()[-5:-3] == ["-", "baseline"] for line in lines[1:]) == 1
     assert len(finished(out)) == 16
     page = check_page(out)
     assert len([tag for tag, _ in page.targets if tag == "a"]) == 16
@@ -211,7 +211,8 @@ def test_a_full_disk(tmp_path, program_cache):
 
 def test_a_specification_on_a_full_disk(cli, tmp_path):
     spec = write_spec(tmp_path / "spec.yaml")
-    with full_disk_after(100):
+    spec.write_text(spec.read_text() + "# as long as notes may be\n" * 400)
+    with full_disk_after(4000):
         done = cli("ablate", spec, "--out", tmp_path / "out")
     assert done.status == 1
     assert f"{tmp_path / 'out' / 'spec.yaml'}: cannot be written" in done.err
