@@ -6,8 +6,8 @@
 
 Each job is one worker. Run it where jobs can be submitted and which the jobs can reach (a login node, or a
 job of its own); DIR and the recordings must be on a file system that all of them see. --print-script shows
-the job's script and submits nothing. Jobs that end at their walltime are replaced, and a killed command goes
-on where it was. Needs ``pip install 'lio-jax[cluster]'``.
+the job's script and submits nothing. What jobs say is in DIR.jobs. Jobs that end at their walltime are
+replaced, and a killed command goes on where it was. Needs ``pip install 'lio-jax[cluster]'``.
 """
 
 import argparse
@@ -60,6 +60,7 @@ def _job(options: argparse.Namespace) -> dict[str, Any]:
         "python": sys.executable,
         "job_extra_directives": [f"--gres=gpu:{options.gpus}"] * (options.gpus > 0),
         "job_script_prologue": options.prologue,
+        "log_directory": f"{options.out}.jobs",
         "scheduler_options": {"dashboard_address": "127.0.0.1:0"},
     }
 

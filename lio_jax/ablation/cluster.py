@@ -27,7 +27,8 @@ class Workers:
     """A dask client and what is known of the workers behind it."""
 
     client: "Client"
-    count: int
+    count: Callable[[], int]
+    """How many there are now."""
     deaths_allowed: int
     """How often a run may take its worker down before it counts as failed."""
     revive: Callable[[], None] = lambda: None
@@ -62,7 +63,7 @@ def on_this_machine(most: int) -> Iterator[Workers]:
         Crew(cluster, environments) as crew,
         Client(cluster) as client,
     ):
-        yield Workers(client, count, deaths_allowed=3, revive=crew.revive)
+        yield Workers(client, lambda: count, deaths_allowed=3, revive=crew.revive)
 
 
 class Crew:
@@ -166,7 +167,11 @@ def at_scheduler(address: str) -> Iterator[Workers]:
                 f"--scheduler {address}: the scheduler has no workers; start some with "
                 f"'dask worker {address} --nthreads 1'."
             ) from None
-        yield Workers(client, len(client.scheduler_info(n_workers=-1)["workers"]), deaths_allowed=0)
+        yield Workers(client, lambda: _workers_of(client), deaths_allowed=0)
+
+
+def _workers_of(client: "Client") -> int:
+    return len(client.scheduler_info(n_workers=-1)["workers"])
 
 
 def visible_gpus() -> list[str]:

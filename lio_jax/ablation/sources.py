@@ -202,4 +202,5 @@ def _located(path: str, folder: Path, place: str) -> str:
             f"{place}: the environment variable {unset.group(1)} is not set; "
             f"set it, for example export {unset.group(1)}=/data/kitti."
         )
-    return str(folder / expanded)
+    # workers may be at home elsewhere
+    return os.path.abspath(folder / expanded)

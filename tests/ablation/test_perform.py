@@ -94,6 +94,8 @@ def test_a_batch_leaves_what_the_runs_one_by_one_leave(tmp_path):
         names.append([{file.name for file in store.folder(task.key).iterdir()} for task in tasks])
         manifests = [json.loads((store.folder(task.key) / "manifest.json").read_text()) for task in tasks]
         assert [manifest["batch"] for manifest in manifests] == ([1] * 4 if batch == 1 else [3, 3, 3, 1])
+        if batch == 1:
+            assert [manifest["timings"]["compile_s"] for manifest in manifests[1:]] == [0, 0, 0]
     assert names[0] == names[1]
     for name in COLUMNS:
         ours, theirs = (np.array(one[name].to_pylist(), float) for one in tables)
