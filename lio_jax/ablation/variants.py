@@ -186,4 +186,6 @@ def _short_names(paths: list[str]) -> dict[str, str]:
 
 
 def _word(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
     return f"{value:.4g}" if isinstance(value, float) else str(value).replace(" ", "")
