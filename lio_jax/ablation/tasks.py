@@ -9,7 +9,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import lio_jax
 from lio_jax.ablation.sources import Source, key_of
 from lio_jax.ablation.spec import Spec
 from lio_jax.ablation.variants import Variant
@@ -70,7 +69,7 @@ def tasks_of(spec: Spec) -> list[Task]:
 @cache
 def code_version() -> str:
     """Return a hash of the code that a result depends on, and of JAX's version."""
-    package = Path(lio_jax.__file__).parent
+    package = Path(__file__).parents[1]
     digest = hashlib.sha256(f"jax {version('jax')} jaxlib {version('jaxlib')}".encode())
     for name in _CODE:
         for file in sorted((package / name).rglob("*.py")):
