@@ -226,6 +226,28 @@ def tune(
     command(data, validate, gt, out, options)
 
 
+@app.command(name="ablate")
+def ablate(
+    spec: Positional[Annotated[Path, arg(metavar="SPEC.yaml")]],
+    out: Annotated[Path, arg(metavar="DIR")],
+    scheduler: Annotated[str, arg(metavar="ADDRESS")] = "",
+    report: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    retry_failed: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+) -> None:
+    """Compare settings over recordings and seeds; the same command goes on where it ended.
+
+    Args:
+        spec: Recordings, settings to compare and metrics; configs/ablations/ has examples.
+        out: Folder for the runs, the table and the report; what is done there is not done again.
+        scheduler: Running dask scheduler; left out, workers are started on this machine.
+        report: Write report.html: ranking, pictures, failures.
+        retry_failed: Try runs again that failed before.
+    """
+    from lio_jax.commands.ablate import ablate as command
+
+    command(spec, out, scheduler, report, retry_failed)
+
+
 @app.command(name="calibrate-imu")
 def calibrate_imu(
     data: Positional[Annotated[Path, arg(metavar="STATIC_DATA")]],

@@ -32,11 +32,11 @@ FLOORS = {
     "cli": 7,
 }
 
-NEIGHBOURS = {("sim", "data"), ("viz", "evaluation"), ("cli", "commands")}
+NEIGHBOURS = {("sim", "data"), ("viz", "evaluation"), ("ablation", "evaluation"), ("cli", "commands")}
 """Imports within a floor, one way only: a simulated drive is a Sequence, a plot against truth is aligned as
-its score is, and a command line has commands."""
+its score is, an ablation scores its runs, and a command line has commands."""
 
-HEAVY = {"rerun", "evo", "matplotlib", "rosbags", "pypcd4"}
+HEAVY = {"rerun", "evo", "matplotlib", "rosbags", "pypcd4", "distributed", "pyarrow"}
 
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 

@@ -68,10 +68,10 @@ def run_and_report(
     """
     check_start(sequence, start)
     with run_folder(out, overwrite):
-        return _run_into(sequence, settings, out, start, count, truth)
+        return run_into(sequence, settings, out, start, count, truth)
 
 
-def _run_into(
+def run_into(
     sequence: Sequence,
     settings: Settings,
     out: Path,
@@ -79,6 +79,7 @@ def _run_into(
     count: int | None,
     truth: Trajectory | None,
 ) -> RunResult:
+    """Run a recording into an empty folder; see :func:`run_and_report`."""
     settings, notes = settings_for(sequence, settings)
     info = sequence.info
     for note in (*info.notes, *notes):

@@ -49,7 +49,7 @@ class KittiSequence:
         self._compensated = config.compensated != "no"
         self._files = self._usable(files)
         self._note_points()
-        self._poses_path = next((p for p in self._pose_candidates() if p.is_file()), None)
+        self._poses_path = next((p for p in pose_files(path) if p.is_file()), None)
         self._T_cam_lidar = self._read_calibration()
 
     @property
@@ -157,10 +157,6 @@ class KittiSequence:
                 f"elevation angles raised by {correction} deg (config.data.vertical_correction_deg)"
             )
 
-    def _pose_candidates(self) -> list[Path]:
-        path = self._path.resolve()
-        return [path / "poses.txt", path.parent.parent / "poses" / f"{path.name}.txt"]
-
     def _read_calibration(self) -> NDArray[np.float64] | None:
         path = self._path / "calib.txt"
         if not path.is_file():
@@ -204,3 +200,9 @@ def raise_elevation(points: NDArray[np.float32], angle_deg: float) -> NDArray[np
     if not has_axis.all():
         raised[~has_axis] = points[~has_axis]
     return raised
+
+
+def pose_files(path: Path) -> list[Path]:
+    """Return where the true poses of a sequence folder may lie, the first that exists counts."""
+    path = path.resolve()
+    return [path / "poses.txt", path.parent.parent / "poses" / f"{path.name}.txt"]

@@ -86,6 +86,7 @@ def run_sequence(
     start: int = 0,
     count: int | None = None,
     observers: Listing[Observer] = (),
+    step: CompiledStep | None = None,
 ) -> RunResult:
     """Estimate the recording's trajectory and map, and write the run folder's files.
 
@@ -98,6 +99,7 @@ def run_sequence(
         start: first scan.
         count: number of scans; None: to the end.
         observers: called after each scan.
+        step: a compiled step of the same settings, to reuse its programs.
 
     Raises:
         UsageError: the recording ends before ``start``.
@@ -105,7 +107,7 @@ def run_sequence(
     """
     check_start(sequence, start)
     began = time.perf_counter()
-    step = CompiledStep(settings)
+    step = step or CompiledStep(settings)
     imu, imu_notes = imu_feed(sequence, settings)
     log = TrajectoryLog()
     stage_ms: dict[str, list[float]] = {"decode": [], "pad": [], "step": [], "record": [], "total": []}
@@ -126,7 +128,7 @@ def run_sequence(
                     overflow.add(tracked)
                     log.append(tracked)
                     if tracked.failure:
-                        failures.append(_failure(start + tracked.index, tracked))
+                        failures.append(failure_record(start + tracked.index, tracked))
                     if map_file:
                         map_file.append(new_map_points(tracked))
                     for observer in observers:
@@ -149,7 +151,7 @@ def run_sequence(
     metrics = {
         "scans": len(log),
         "prediction": "inertial samples" if imu else "constant velocity",
-        "scan_ms": {stage: _percentiles(values) for stage, values in stage_ms.items() if values},
+        "scan_ms": {stage: percentiles(values) for stage, values in stage_ms.items() if values},
         "compile_s": round(step.compile_s, 4),
         "wall_s": round(time.perf_counter() - began, 4),
         "peak_rss_mb": round(peak_rss_mb(), 1),
@@ -235,11 +237,13 @@ def _timed(scans: Iterator[LidarScan], decode_ms: list[float]) -> Iterator[Lidar
         yield scan
 
 
-def _failure(number: int, tracked: Tracked) -> dict[str, Any]:
+def failure_record(number: int, tracked: Tracked) -> dict[str, Any]:
+    """Return what metrics.json says of a scan that failed; ``number``: in the recording."""
     message = f"scan {number}: {tracked.failure}"
     return {"scan": number, "stamp_ns": tracked.stamp_ns, "message": message}
 
 
-def _percentiles(values: list[float]) -> dict[str, float]:
+def percentiles(values: list[float]) -> dict[str, float]:
+    """Return what metrics.json says of a stage's times, ms."""
     median, p95, p99 = np.percentile(values, [50, 95, 99])
     return {"median": round(median, 3), "p95": round(p95, 3), "p99": round(p99, 3)}

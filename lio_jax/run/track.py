@@ -45,20 +45,40 @@ class Tracked:
     """What went wrong with this scan, or nothing."""
 
 
-class CompiledStep:
-    """A recipe's step, compiled once per scan size, with the compile time kept apart from the run time."""
+class Programs:
+    """A recipe's programs under one static config, for any parameters and any recording."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._recipe = recipe = recipe_named(settings.recipe)
-        self.config: Config = settings.config
-        self.params: Params = settings.params()
-        self.init_programs = PerShape(jax.jit(partial(recipe.init, self.config)))
-        self.step_programs = PerShape(jax.jit(partial(recipe.step, self.config), donate_argnums=1))
+    def __init__(self, recipe: str, config: Config) -> None:
+        self.recipe = recipe_named(recipe)
+        self.init = PerShape(jax.jit(partial(self.recipe.init, config)))
+        self.step = PerShape(jax.jit(partial(self.recipe.step, config), donate_argnums=1))
 
     @property
     def compile_s(self) -> float:
         """Return the time spent on compiling so far, s."""
-        return self.init_programs.compile_s + self.step_programs.compile_s
+        return self.init.compile_s + self.step.compile_s
+
+
+class CompiledStep:
+    """A recipe's step, compiled once per scan size, with the compile time kept apart from the run time."""
+
+    def __init__(self, settings: Settings, programs: Programs | None = None) -> None:
+        """Take the parameters.
+
+        Args:
+            settings: recipe, config and params.
+            programs: of the same recipe and config, to reuse them; None: new ones.
+        """
+        self._programs = programs = programs or Programs(settings.recipe, settings.config)
+        self.config: Config = settings.config
+        self.params: Params = settings.params()
+        self.init_programs, self.step_programs = programs.init, programs.step
+        self._compiled_before_s = programs.compile_s
+
+    @property
+    def compile_s(self) -> float:
+        """Return the time spent on compiling since this step was made, s."""
+        return self._programs.compile_s - self._compiled_before_s
 
     def initial_state(self, imu: Any) -> Any:
         """Return the recipe's state before the first scan; ``imu``: samples up to its end, or None."""
@@ -67,7 +87,7 @@ class CompiledStep:
     def restarted(self, state: Any, imu: Any) -> Any:
         """Return the state before the first scan, with the velocity that ``state`` found."""
         # no program of its own, which takes as long to compile as the first
-        return self._recipe.moving_as(self.initial_state(imu), state)
+        return self._programs.recipe.moving_as(self.initial_state(imu), state)
 
     def __call__(self, state: Any, scan: Any, imu: Any) -> tuple[Any, Any]:
         """Run one step; ``state`` is consumed."""
@@ -89,26 +109,36 @@ def track(
         step: a compiled step of the same settings, to reuse its programs over several recordings.
     """
     step = step or CompiledStep(settings)
-    last_evidence: Evidence | None = None
+    judged = Judged(settings)
     compiled_s = step.compile_s
     for fed, state, output in stepped(step, feed(settings, scans, imu)):
         nav, result = jax.tree.map(np.array, (state.nav, output.registration))
-        lost, nis = bool(output.lost), float(output.nis)
-        done = time.perf_counter()
+        step_ms = (time.perf_counter() - fed.padded_at - (step.compile_s - compiled_s)) * 1e3
+        compiled_s = step.compile_s
+        yield judged(fed, nav, result, output, step_ms)
+
+
+class Judged:
+    """Puts each scan's result together with what went wrong with it."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._before: Evidence | None = None
+
+    def __call__(self, fed: "Fed", nav: Any, registration: Any, output: Any, step_ms: float) -> Tracked:
+        """Return the result of a scan; ``nav`` and ``registration`` have numpy leaves."""
         evidence = Evidence(
             points=fed.count,
             nav=nav,
-            registration=result,
-            lost=lost,
-            nis=nis,
+            registration=registration,
+            lost=bool(output.lost),
+            nis=float(output.nis),
             since_last_s=float(fed.scan.interval),
             imu_gap_s=_imu_gap(fed.imu, fed.scan, nav) if fed.imu else None,
         )
-        failure = failure_of(evidence, last_evidence, settings)
-        last_evidence = evidence
-        step_ms = (done - fed.padded_at - (step.compile_s - compiled_s)) * 1e3
-        compiled_s = step.compile_s
-        yield Tracked(
+        failure = failure_of(evidence, self._before, self._settings)
+        self._before = evidence
+        return Tracked(
             index=fed.index,
             stamp_ns=fed.end_ns,
             T_world_imu=pose_matrix(nav.T_world_imu.wxyz_xyz),

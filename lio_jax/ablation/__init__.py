@@ -1,0 +1,1 @@
+"""Many runs at once, compared fairly: recordings x settings, each run once, gathered into a table."""

@@ -1,0 +1,145 @@
+"""Several parameter sets over one recording in one program: the recipe's step under vmap."""
+
+import time
+from collections.abc import Sequence as Listing
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from lio_jax.core.config import Config
+from lio_jax.core.errors import LioJaxError
+from lio_jax.core.settings import Settings
+from lio_jax.data.prefetch import prefetched
+from lio_jax.data.sequence import Sequence
+from lio_jax.recipes import recipe_named
+from lio_jax.run.compilation import PerShape
+from lio_jax.run.overflow import Overflow
+from lio_jax.run.run import check_start, failure_record, imu_feed, percentiles
+from lio_jax.run.track import Judged, Tracked, feed, stepped
+from lio_jax.run.trajectory_log import TrajectoryLog
+
+
+class BatchPrograms:
+    """A recipe's programs under one static config, for a batch of parameters."""
+
+    def __init__(self, recipe: str, config: Config) -> None:
+        self.recipe = recipe_named(recipe)
+        self.init = PerShape(jax.jit(jax.vmap(partial(self.recipe.init, config), (0, None))))
+        over_states = jax.vmap(partial(self.recipe.step, config), (0, 0, None, None))
+        self.step = PerShape(jax.jit(over_states, donate_argnums=1))
+
+    @property
+    def compile_s(self) -> float:
+        """Return the time spent on compiling so far, s."""
+        return self.init.compile_s + self.step.compile_s
+
+
+@dataclass(frozen=True)
+class BatchedRun:
+    """What one parameter set gave."""
+
+    log: TrajectoryLog
+    metrics: dict[str, Any]
+    """As in metrics.json; times are the batch's, divided by its size."""
+
+
+def same_batch(settings: Settings) -> tuple[Any, ...]:
+    """Return what the members of a batch have to share."""
+    offset = settings.values["extrinsics"]["time_offset"]
+    estimated = settings.values["initial"]["time_offset_sigma"] > 0
+    return settings.recipe, settings.config, offset, estimated
+
+
+def run_batch(
+    sequence: Sequence,
+    settings: Listing[Settings],
+    programs: BatchPrograms,
+    start: int = 0,
+    count: int | None = None,
+) -> list[BatchedRun]:
+    """Run the parameter sets over a recording side by side.
+
+    Args:
+        sequence: the recording, read once.
+        settings: resolved, all alike in :func:`same_batch`.
+        programs: of their recipe and config.
+        start: first scan.
+        count: number of scans; None: to the end.
+
+    Raises:
+        LioJaxError: no scan could be read.
+    """
+    check_start(sequence, start)
+    began, compiled_s = time.perf_counter(), programs.compile_s
+    first = settings[0]
+    imu, imu_notes = imu_feed(sequence, first)
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[one.params() for one in settings])
+    runs = [_Run(one, start) for one in settings]
+    scans: Any = prefetched(sequence.scans(start, count), first.config.data.prefetch)
+    compiled = programs.compile_s
+    for fed, state, output in stepped(_BatchStep(programs, stacked), feed(first, scans, imu)):
+        nav, seen = jax.device_get((state.nav, output))
+        step_s = time.perf_counter() - fed.padded_at - (programs.compile_s - compiled)
+        compiled = programs.compile_s
+        for number, run in enumerate(runs):
+            own_nav, own = jax.tree.map(lambda leaf, number=number: leaf[number], (nav, seen))
+            run.add(run.judged(fed, own_nav, own.registration, own, step_s * 1e3 / len(runs)))
+    if not len(runs[0].log):
+        reasons = " ".join(sequence.warnings_so_far)
+        raise LioJaxError(f"{sequence.info.path}: no scan could be read. {reasons}".strip())
+    shared = {
+        "prediction": "inertial samples" if imu else "constant velocity",
+        "compile_s": round((programs.compile_s - compiled_s) / len(runs), 4),
+        "wall_s": round((time.perf_counter() - began) / len(runs), 4),
+    }
+    warnings = [*sequence.warnings_so_far, *imu_notes, *(imu.warnings() if imu else ())]
+    return [BatchedRun(run.log, run.metrics() | shared | run.warned(warnings)) for run in runs]
+
+
+class _Run:
+    """What is kept of one parameter set."""
+
+    def __init__(self, settings: Settings, start: int) -> None:
+        self.log = TrajectoryLog()
+        self.judged = Judged(settings)
+        self._start = start
+        self._overflow = Overflow(settings)
+        self._failures: list[dict[str, Any]] = []
+        self._stage_ms: dict[str, list[float]] = {"step": [], "total": []}
+
+    def add(self, tracked: Tracked) -> None:
+        self.log.append(tracked)
+        self._overflow.add(tracked)
+        if tracked.failure:
+            self._failures.append(failure_record(self._start + tracked.index, tracked))
+        for stage, values in self._stage_ms.items():
+            values.append(tracked.stage_ms[stage])
+
+    def metrics(self) -> dict[str, Any]:
+        return {
+            "scans": len(self.log),
+            "scan_ms": {stage: percentiles(values) for stage, values in self._stage_ms.items()},
+            "failures": self._failures,
+            "overflow": self._overflow.metrics(),
+        }
+
+    def warned(self, warnings: list[str]) -> dict[str, Any]:
+        return {"warnings": [*warnings, *self._overflow.warnings()]}
+
+
+class _BatchStep:
+    """A :class:`lio_jax.run.track.Step` over a batch of states."""
+
+    def __init__(self, programs: BatchPrograms, params: Any) -> None:
+        self.initial_state = partial(programs.init, params)
+        self._moving_as = programs.recipe.moving_as
+        self._step = partial(programs.step, params)
+
+    def restarted(self, state: Any, imu: Any) -> Any:
+        return self._moving_as(self.initial_state(imu), state)
+
+    def __call__(self, state: Any, scan: Any, imu: Any) -> tuple[Any, Any]:
+        return self._step(state, scan, imu)

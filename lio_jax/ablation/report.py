@@ -1,0 +1,145 @@
+"""An ablation as one HTML page that needs nothing but itself."""
+
+import json
+from collections.abc import Iterable, Sequence
+from html import escape
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from lio_jax.ablation.comparison import Comparison, cells, header, number
+from lio_jax.ablation.metric_names import METRICS, TIME
+from lio_jax.ablation.pictures import parameter_picture, pareto_picture
+from lio_jax.ablation.store import Store
+from lio_jax.run.folder import write_text
+
+_STYLE = """
+:root{color-scheme:light}body{font:16px/1.5 system-ui,sans-serif;color:#222;background:#fff;margin:0 auto;
+max-width:70rem;padding:1rem}h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}
+.wide{overflow-x:auto}table{border-collapse:collapse;font-variant-numeric:tabular-nums;font-size:.9rem}
+td,th{padding:.3rem .6rem;border-bottom:1px solid #ddd;text-align:right;white-space:nowrap}
+td:first-child,th:first-child{text-align:left}td.text{text-align:left;white-space:normal}
+.pictures{display:flex;flex-wrap:wrap;gap:1rem}img{max-width:100%;height:auto}
+figure{margin:0}.soft{color:#666;font-size:.9rem}pre{overflow-x:auto;background:#f6f6f6;padding:.7rem}
+"""
+
+
+def write_report(comparison: Comparison, store: Store) -> None:
+    """Write report.html into the ablation's folder."""
+    write_text(store.root / "report.html", report(comparison, store))
+
+
+def report(comparison: Comparison, store: Store) -> str:
+    """Return the page."""
+    spec = comparison.spec
+    total = len(comparison.tasks)
+    size = f"{len(spec.variants)} variants on {len(spec.sources)} recordings"
+    parts = [
+        f"<h1>{escape(spec.name)}</h1>",
+        f"<p>{size}: {len(comparison.done)} of {total} runs done, {len(comparison.failures)} failed.</p>",
+        "<h2>Ranking</h2>",
+        _table(header(spec), [[escape(cell) for cell in cells(row, comparison)] for row in comparison.rows]),
+        f'<p class="soft">{escape(_explained(comparison))}</p>',
+        *_pictures(comparison),
+        *_failures(comparison),
+        "<h2>Runs</h2>",
+        _runs(comparison, store),
+        f"<details><summary>Specification</summary><pre>{escape(spec.text)}</pre></details>",
+    ]
+    head = (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>{escape(spec.name)}</title><style>{_STYLE}</style></head>"
+    )
+    return f"{head}<body>{''.join(parts)}</body></html>\n"
+
+
+def _explained(comparison: Comparison) -> str:
+    return (
+        f"Means over recordings and seeds; ranked by {comparison.metric}, incomplete variants last. "
+        "± seeds: standard deviation over seeds of the mean over recordings. vs baseline: geometric mean of "
+        f"the ratio to '{comparison.spec.baseline.name}' on the same recording and seed. p (t): two-sided "
+        "paired t-test of the logarithms (of the values where some are not positive); p (ranks): Wilcoxon's "
+        "signed-rank test on the same pairs, from six on. The verdict takes p (t), corrected by Holm for "
+        "the number of variants, below 0.05. Times are those of runs beside each other on one machine."
+    )
+
+
+def _pictures(comparison: Comparison) -> Iterable[str]:
+    by_variant = comparison.values[comparison.metric]
+    label = _labelled(comparison.metric)
+    if not by_variant:
+        return
+    drawn = []
+    means = {name: (name, errors) for name, errors in by_variant.items()}
+    times = comparison.values[TIME]
+    points = {
+        name: (float(np.mean([*times[name].values()])), float(np.mean([*errors.values()])))
+        for name, errors in means.values()
+        if times.get(name) and len(errors) == len(comparison.spec.sources)
+    }
+    if points and comparison.metric != TIME:
+        drawn.append(("Error against time", pareto_picture(points, _labelled(TIME), label)))
+    for path in dict.fromkeys(path for variant in comparison.spec.variants for path in variant.overrides):
+        found: dict[Any, list[float]] = {}
+        for variant in comparison.spec.variants:
+            if path in variant.overrides and variant.name in by_variant:
+                value = variant.overrides[path]
+                key = value if isinstance(value, int | float | str) else json.dumps(value)
+                found.setdefault(key, []).extend(by_variant[variant.name].values())
+        if len(found) > 1:
+            drawn.append((path, parameter_picture(path, found, label)))
+    if drawn:
+        yield '<h2>Pictures</h2><div class="pictures">'
+        for title, uri in drawn:
+            yield f'<figure><img alt="{escape(title)}" src="{uri}"></figure>'
+        yield "</div>"
+
+
+def _failures(comparison: Comparison) -> Iterable[str]:
+    if not comparison.failures:
+        return
+    yield "<h2>Failed</h2>"
+    rows = [
+        [escape(record["run"]), f"{escape(record['reason'])}{_folded(record['traceback'])}"]
+        for record in comparison.failures.values()
+    ]
+    yield _table(["run", "reason"], rows, text=True)
+
+
+def _folded(trace: str) -> str:
+    return f"<details><summary>traceback</summary><pre>{escape(trace)}</pre></details>" if trace else ""
+
+
+def _runs(comparison: Comparison, store: Store) -> str:
+    metrics = comparison.spec.metrics
+    rows = []
+    for task in comparison.tasks:
+        if task.key not in comparison.done:
+            continue
+        own = store.folder(task.key) / "report.html"
+        target = f"tasks/{quote(task.key)}/" + ("report.html" if own.exists() else "")
+        case = (task.source.name, task.source.seed)
+        values = [comparison.values[metric].get(task.variant.name, {}).get(case) for metric in metrics]
+        rows.append(
+            [
+                f'<a href="{target}">{escape(task.source.name)}</a>',
+                "-" if task.source.seed is None else str(task.source.seed),
+                escape(task.variant.name),
+                *("-" if value is None else number(value) for value in values),
+            ]
+        )
+    return _table(["sequence", "seed", "variant", *map(_labelled, metrics)], rows)
+
+
+def _table(names: Sequence[str], rows: Iterable[Sequence[str]], text: bool = False) -> str:
+    """Return a table; the names are escaped here, the cells before."""
+    kind = '<td class="text">' if text else "<td>"
+    head = "".join(f"<th>{escape(name)}</th>" for name in names)
+    body = "".join("<tr>" + "".join(f"{kind}{cell}</td>" for cell in row) + "</tr>" for row in rows)
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _labelled(metric: str) -> str:
+    return f"{metric} [{METRICS[metric]}]" if METRICS[metric] else metric

@@ -1,0 +1,206 @@
+"""The recordings of an ablation, on disk or simulated; by its identity one tells whether it changed."""
+
+import hashlib
+import json
+import os
+import re
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from lio_jax.core.config import DataConfig
+from lio_jax.core.errors import LioJaxError, UsageError
+from lio_jax.data.kitti import pose_files
+from lio_jax.data.open import open_sequence
+from lio_jax.data.sequence import Sequence
+from lio_jax.data.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A recording on disk. The estimator draws nothing at random, so no seed changes its result."""
+
+    name: str
+    path: str
+    truth_file: str = ""
+    """Trajectory to compare with; "": the recording's own."""
+    start: int = 0
+    """First scan."""
+    scans: int | None = None
+    """How many; None: to the end."""
+
+    @property
+    def seed(self) -> int | None:
+        """None: nothing is random."""
+        return None
+
+    def identity(self) -> dict[str, Any]:
+        """Return what the result depends on: every file's name, size and time of change, not its folder."""
+        path = Path(self.path)
+        files = sorted(entry for entry in path.rglob("*") if entry.is_file()) if path.is_dir() else [path]
+        beside = [Path(self.truth_file)] if self.truth_file else pose_files(path)
+        digest = hashlib.sha256()
+        for file in [*files, *beside]:
+            if file.exists():
+                name = file.relative_to(path) if path in file.parents else file.name
+                status = file.stat()
+                digest.update(f"{name} {status.st_size} {status.st_mtime_ns}\n".encode())
+        return {
+            "files": digest.hexdigest(),
+            "exists": path.exists(),
+            "start": self.start,
+            "scans": self.scans,
+        }
+
+    def open(self, config: DataConfig) -> Sequence:
+        """Open the recording.
+
+        Raises:
+            LioJaxError: it is not there, or broken.
+        """
+        return open_sequence(Path(self.path), config)
+
+    def truth(self, sequence: Sequence) -> Trajectory | None:
+        """Return the true T_world_imu, None where it is not known."""
+        if not self.truth_file:
+            return sequence.truth()
+        from lio_jax.evaluation.load import load_trajectory
+
+        loaded = load_trajectory(Path(self.truth_file))
+        if not loaded.stamped:
+            raise LioJaxError(f"{self.truth_file}: has no time stamps; give a TUM file as truth.")
+        return loaded.trajectory
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A drive through a simulated world."""
+
+    name: str
+    """Without the seed."""
+    sim: str
+    """World."""
+    seed: int = 0
+    """Of world, motion and noise."""
+    sensor: str = "generic32"
+    duration: float = 10.0
+    """s."""
+    beams: int | None = None
+    columns: int | None = None
+    imu: bool = True
+    """Whether there are inertial samples."""
+    moving_start: bool = False
+    start: int = 0
+    scans: int | None = None
+
+    def identity(self) -> dict[str, Any]:
+        """Return what the result depends on."""
+        return {key: value for key, value in asdict(self).items() if key != "name"}
+
+    def open(self, config: DataConfig) -> Sequence:
+        """Build the world."""
+        from lio_jax.sim.imu import ImuModel
+        from lio_jax.sim.sequence import SimulatedSequence
+
+        return SimulatedSequence(
+            self.sim,
+            self.sensor,
+            self.duration,
+            self.seed,
+            beams=self.beams,
+            columns=self.columns,
+            imu=ImuModel() if self.imu else None,
+            moving_start=self.moving_start,
+        )
+
+    def truth(self, sequence: Sequence) -> Trajectory | None:
+        """Return the true T_world_imu."""
+        return sequence.truth()
+
+
+Source = Recorded | Simulated
+
+RECORDED_KEYS: dict[str, Any] = {"path": str, "name": str, "truth": str, "start": int, "scans": int}
+SIMULATED_KEYS: dict[str, Any] = {
+    "sim": str,
+    "name": str,
+    "sensor": str,
+    "duration": float,
+    "beams": int,
+    "columns": int,
+    "imu": bool,
+    "moving_start": bool,
+    "start": int,
+    "scans": int,
+}
+"""What an entry of ``sequences`` may hold, and of which type."""
+
+
+def key_of(source: Source) -> str:
+    """Return a hash of a recording's identity and name."""
+    return hashlib.sha256(json.dumps([source.name, source.identity()]).encode()).hexdigest()[:16]
+
+
+def recorded(entry: dict[str, Any], folder: Path, place: str) -> list[Recorded]:
+    """Return the recordings that an entry with ``path`` names.
+
+    ``~`` and ``$VARIABLES`` are replaced, and ``{00..10}`` or ``{a,b}`` stands for several, as in a shell; a
+    truth file either holds for the only path, or names as many as there are paths.
+
+    Args:
+        entry: of RECORDED_KEYS, checked.
+        folder: relative paths start there.
+        place: file and key for messages.
+    """
+    paths = [_located(path, folder, place) for path in braces(entry["path"])]
+    truths = [_located(path, folder, place) for path in braces(entry.get("truth") or "") if path]
+    if truths and len(truths) != len(paths):
+        raise UsageError(f"{place}: truth names {len(truths)} files for {len(paths)} recordings.")
+    common = {key: entry[key] for key in ("start", "scans") if key in entry}
+    sources = []
+    for number, path in enumerate(paths):
+        name = Path(path).name if len(paths) > 1 or "name" not in entry else entry["name"]
+        if len(paths) > 1 and "name" in entry:
+            name = f"{entry['name']}_{name}"
+        sources.append(Recorded(name, path, truths[number] if truths else "", **common))
+    return sources
+
+
+def simulated(entry: dict[str, Any], seeds: tuple[int, ...], place: str) -> list[Simulated]:
+    """Return an entry with ``sim``, once per seed; ``entry`` is of SIMULATED_KEYS, checked."""
+    from lio_jax.sim.sensors import SENSORS
+    from lio_jax.sim.world_registry import WORLDS
+
+    drive = Simulated(**{"name": entry["sim"], **entry})
+    for kind, name, known in (("world", drive.sim, WORLDS), ("sensor", drive.sensor, SENSORS)):
+        if name not in known:
+            raise UsageError(
+                f"{place}: {kind} '{name}' is unknown; choose one of: {', '.join(sorted(known))}."
+            )
+    return [replace(drive, seed=seed) for seed in seeds]
+
+
+def braces(text: str) -> list[str]:
+    """Return the words that ``a{00..02}`` or ``a{x,y}`` stands for, as in a shell."""
+    found = re.search(r"\{([^{}]*(?:\.\.|,)[^{}]*)\}", text)
+    if not found:
+        return [text]
+    inner = found.group(1)
+    if bounds := re.fullmatch(r"(\d+)\.\.(\d+)", inner):
+        width = len(bounds.group(1))
+        words = [f"{n:0{width}d}" for n in range(int(bounds.group(1)), int(bounds.group(2)) + 1)]
+    else:
+        words = inner.split(",")
+    before, after = text[: found.start()], text[found.end() :]
+    return [whole for word in words for whole in braces(before + word + after)]
+
+
+def _located(path: str, folder: Path, place: str) -> str:
+    expanded = os.path.expandvars(os.path.expanduser(path))
+    if unset := re.search(r"\$\{?(\w+)", expanded):
+        raise UsageError(
+            f"{place}: the environment variable {unset.group(1)} is not set; "
+            f"set it, for example export {unset.group(1)}=/data/kitti."
+        )
+    # workers may be at home elsewhere
+    return os.path.abspath(folder / expanded)

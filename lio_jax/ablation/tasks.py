@@ -1,0 +1,95 @@
+"""The runs of an ablation, each named by a hash of everything its result depends on."""
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from lio_jax.ablation.sources import Source, key_of
+from lio_jax.ablation.spec import Spec
+from lio_jax.ablation.variants import Variant
+from lio_jax.core.settings import Settings
+
+_FORMAT = 1
+"""Of what a task leaves behind; another number runs everything anew."""
+_CODE = (
+    *("core", "imu", "lidar", "mapping", "registration", "estimation", "loops"),
+    *("recipes", "data", "sim", "run", "evaluation"),
+)
+"""The packages that a run's result depends on."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One run: a recording with one set of settings."""
+
+    source: Source
+    variant: Variant = field(hash=False)
+    keep: str
+    batch: int | None
+    """Parameter sets in one program; the result does not depend on it."""
+    key: str
+    """Hash of the recording's identity, the settings, what is kept and the code."""
+    source_key: str
+
+    @property
+    def settings(self) -> Settings:
+        """Return the settings, before the recording adds its own."""
+        return self.variant.settings
+
+    def describe(self) -> str:
+        """Return a line for a person."""
+        seed = "" if self.source.seed is None else f" seed {self.source.seed}"
+        return f"{self.source.name}{seed}, {self.variant.name}"
+
+
+def tasks_of(spec: Spec) -> list[Task]:
+    """Return every recording with every variant, recording by recording."""
+    tasks = []
+    for source in spec.sources:
+        source_key = key_of(source)
+        for variant in spec.variants:
+            identity = [
+                _FORMAT,
+                source_key,
+                spec.keep,
+                variant.settings.as_dict(),
+                sorted(variant.settings.given),
+                code_version(),
+            ]
+            key = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:20]
+            tasks.append(Task(source, variant, spec.keep, spec.batch, key, source_key))
+    return tasks
+
+
+@cache
+def code_version() -> str:
+    """Return a hash of the code that a result depends on, and of JAX's version."""
+    package = Path(__file__).parents[1]
+    digest = hashlib.sha256(f"jax {version('jax')} jaxlib {version('jaxlib')}".encode())
+    for name in _CODE:
+        for file in sorted((package / name).rglob("*.py")):
+            digest.update(str(file.relative_to(package)).encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:20]
+
+
+def pieces(tasks: Iterable[Task], workers: int) -> list[tuple[Task, ...]]:
+    """Put the tasks together that one worker does in order.
+
+    Those of one recording and one static config share their compiled programs and decoded scans. A group is
+    split only where it would keep one worker busy while others have nothing to do.
+    """
+    groups: dict[Any, list[Task]] = {}
+    tasks = list(tasks)
+    for task in tasks:
+        groups.setdefault((task.source_key, task.settings.recipe, task.settings.config), []).append(task)
+    longest = -(-len(tasks) // max(workers, 1))
+    return [
+        tuple(group[start : start + longest])
+        for group in groups.values()
+        for start in range(0, len(group), longest)
+    ]

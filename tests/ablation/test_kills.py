@@ -1,0 +1,111 @@
+"""SIGKILL of workers and of the whole command, at random moments: nothing is lost, nothing is half there."""
+
+import json
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("distributed", reason="dask.distributed is not installed")
+import psutil
+
+from tests.ablation import trivial
+
+KILLS_OF_WORKERS, KILLS_OF_COMMANDS = 15, 6
+
+
+def results(root):
+    """Return what is in every finished result, and tell it from a later one of the same name."""
+    tasks = root / "tasks"
+    found = {}
+    for entry in tasks.iterdir() if tasks.is_dir() else ():
+        if not entry.name.startswith("."):
+            assert {file.name for file in entry.iterdir()} == {"first.txt", "second.txt"}
+            for file in entry.iterdir():
+                assert file.read_text() == trivial.content(entry.name)
+            found[entry.name] = (entry.stat().st_ino, entry.stat().st_mtime_ns)
+    return found
+
+
+def check_all_done(root):
+    assert set(results(root)) == {task.key for task in trivial.tasks()}
+    assert not [entry for entry in (root / "tasks").iterdir() if entry.name.startswith(".")]
+    assert not (root / "failed").exists()
+
+
+def worker_processes(of):
+    try:
+        children = of.children(recursive=True)
+        return [child for child in children if any("spawn_main" in word for word in child.cmdline())]
+    except psutil.NoSuchProcess:
+        return []
+
+
+def test_workers_are_killed(tmp_path):
+    """The same command goes on: a run whose worker dies is begun again."""
+    draw = random.Random(1)
+    killed, over = [], threading.Event()
+
+    def kill_now_and_then():
+        while len(killed) < KILLS_OF_WORKERS and not over.is_set():
+            over.wait(draw.uniform(0.05, 0.6))
+            if running := worker_processes(psutil.Process()):
+                victim = draw.choice(running)
+                victim.kill()
+                killed.append(victim.pid)
+
+    killer = threading.Thread(target=kill_now_and_then, daemon=True)
+    root = tmp_path / "out"
+    # before the first worker is ready as well as in the middle of its runs
+    killer.start()
+    trivial.run(root)
+    over.set()
+    killer.join()
+    assert len(killed) == KILLS_OF_WORKERS
+    check_all_done(root)
+
+
+def test_commands_are_killed(tmp_path):
+    """The command is started anew each time; what was done stays as it was, to the last one."""
+    draw = random.Random(2)
+    root = tmp_path / "out"
+    before, kills = {}, 0
+    while kills < KILLS_OF_COMMANDS:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "tests.ablation.trivial", str(root)],
+            cwd=Path(__file__).parents[2],
+            stderr=subprocess.DEVNULL,
+        )
+        workers = []
+        deadline = time.monotonic() + draw.uniform(0.2, 5.0)
+        while time.monotonic() < deadline and process.poll() is None:
+            workers = worker_processes(psutil.Process(process.pid)) or workers
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        kills += 1
+        # workers notice that the command is gone
+        assert not psutil.wait_procs(workers, timeout=10)[1]
+        now = results(root)
+        assert {key: now.get(key) for key in before} == before
+        before = now
+    trivial.run(root)
+    now = results(root)
+    assert {key: now[key] for key in before} == before
+    check_all_done(root)
+    assert kills == KILLS_OF_COMMANDS
+
+
+def test_a_run_that_takes_its_worker_down_each_time(tmp_path):
+    """Counts as failed after some tries; what comes after it is done."""
+    root = tmp_path / "out"
+    trivial.run(root, trivial.poisoned)
+    assert set(results(root)) == {task.key for task in trivial.tasks()} - {trivial.POISON}
+    (record,) = (root / "failed").iterdir()
+    assert record.stem == trivial.POISON
+    assert json.loads(record.read_text())["reason"].startswith("the worker process died each time")
