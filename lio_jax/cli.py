@@ -139,6 +139,22 @@ def evaluate(
     command(estimate, reference, json)
 
 
+@app.command(name="report")
+def report(
+    folders: Positional[Annotated[tuple[Path, ...], arg(metavar="DIR [DIR ...]")]],
+    out: Annotated[Path | None, arg(metavar="FILE")] = None,
+) -> None:
+    """Draw a run's report anew, or compare several runs on one page.
+
+    Args:
+        folders: Folders that lio-jax run wrote.
+        out: HTML file; None means report.html in the one folder.
+    """
+    from lio_jax.commands.report import report as command
+
+    command(folders, out)
+
+
 @app.command(name="export")
 def export(
     data: Data,

@@ -9,10 +9,11 @@ from tqdm import tqdm
 
 from lio_jax.commands.runtime import say
 from lio_jax.core.errors import LioJaxError, UsageError
+from lio_jax.core.files import atomic_path
 from lio_jax.core.settings import Settings, load_settings, recipe_settings, with_overrides
 from lio_jax.data.open import open_sequence
 from lio_jax.data.sequence import Sequence
-from lio_jax.data.trajectory import Trajectory
+from lio_jax.data.trajectory import Trajectory, write_tum
 from lio_jax.recipes import recipe_named
 from lio_jax.run.folder import run_folder, write_json
 from lio_jax.run.run import Observer, RunResult, check_start, run_sequence, settings_for
@@ -100,6 +101,7 @@ def _run_into(
             recording.log_map(result.map_points)
         if recording and truth is not None:
             recording.log_truth(_in_world_of(result.trajectory, truth).positions)
+    result.metrics["notes"] = [*sequence.info.notes, *notes]
     evaluation_text = _finish(result, truth, settings, out, info.name)
     _warn(result.metrics["warnings"])
     _warn([failure["message"] for failure in result.metrics["failures"]])
@@ -172,9 +174,10 @@ def truth_of(sequence: Sequence, gt: Path | None) -> Trajectory | None:
 
 
 def _finish(result: RunResult, truth: Trajectory | None, settings: Settings, out: Path, name: str) -> str:
-    """Add the errors against truth to metrics.json, draw, and return the errors as a table."""
+    """Add notes and errors against truth to the folder, draw, and return the errors as a table."""
     text = ""
     if truth is not None:
+        from lio_jax.evaluation.association import match_by_time
         from lio_jax.evaluation.evaluate import evaluate
         from lio_jax.evaluation.report import format_evaluation
 
@@ -183,15 +186,23 @@ def _finish(result: RunResult, truth: Trajectory | None, settings: Settings, out
         except LioJaxError as error:
             say(f"warning: no comparison with the truth: {error}")
         else:
-            result.metrics |= evaluation.as_dict()
-            write_json(out / "metrics.json", result.metrics)
+            # the evaluation has notes of its own
+            noted = [*result.metrics["notes"], *evaluation.notes]
+            result.metrics |= evaluation.as_dict() | {"notes": noted}
             text = format_evaluation(evaluation)
+            with atomic_path(out / "truth.tum") as aside:
+                write_tum(aside, match_by_time(result.trajectory, truth).reference)
+    write_json(out / "metrics.json", result.metrics)
     if settings.config.output.plot:
         from lio_jax.viz.plot import plot_timings, plot_trajectory
 
         plot_trajectory(out / "trajectory.png", result.trajectory, truth, name)
         stages = {name: ms for name, ms in result.stage_ms.items() if ms and name != "total"}
         plot_timings(out / "timings.png", stages)
+    if settings.config.output.report:
+        from lio_jax.viz.report import write_report
+
+        write_report(out)
     return text
 
 

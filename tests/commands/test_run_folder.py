@@ -23,6 +23,9 @@ FILES = {
     "recording.rrd",
     "trajectory.png",
     "timings.png",
+    "scans.npz",
+    "truth.tum",
+    "report.html",
 }
 
 
