@@ -80,16 +80,22 @@ def inspect(
     data: Data,
     set_: Assignments = (),
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    write_config: Annotated[Path | None, arg(metavar="FILE")] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Say what is in a recording, what is wrong with it and which settings fit.
 
     Args:
         data: Recording: KITTI folder, ROS bag or native folder.
         json: Print one JSON object instead of a table.
+        write_config: Write the settings that fit, for --recipe of lio-jax run.
+        overwrite: Replace that file.
     """
     from lio_jax.commands.inspect import inspect as command
+    from lio_jax.commands.runtime import prepare_jax
 
-    command(data, set_, json)
+    prepare_jax()
+    command(data, set_, json, write_config, overwrite)
 
 
 @app.command(name="run")
