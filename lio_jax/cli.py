@@ -108,6 +108,7 @@ def run(
     scans: Annotated[int | None, arg(metavar="N")] = None,
     gt: Annotated[Path | None, arg(metavar="FILE")] = None,
     overwrite: Overwrite = False,
+    live: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> None:
     """Estimate trajectory and map of a recording.
 
@@ -119,12 +120,13 @@ def run(
         scans: How many scans; None means all.
         gt: Ground truth of T_world_imu (TUM, run folder or recording); None means the recording's own.
         overwrite: Replace the results of an earlier run in that folder.
+        live: Show it in a browser of this computer while it runs.
     """
     from lio_jax.commands.run import run as command
     from lio_jax.commands.runtime import prepare_jax
 
     prepare_jax()
-    command(data, recipe, set_, out, start, scans, gt, overwrite)
+    command(data, recipe, set_, out, start, scans, gt, overwrite, live)
 
 
 @app.command(name="eval")
@@ -159,6 +161,22 @@ def report(
     from lio_jax.commands.report import report as command
 
     command(folders, out)
+
+
+@app.command(name="view")
+def view(
+    folder: Positional[Annotated[Path, arg(metavar="DIR")]],
+    web: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+) -> None:
+    """Open a run's recording: clouds, map, trajectory and what the estimator knew, over time.
+
+    Args:
+        folder: Folder that lio-jax run wrote, or an .rrd.
+        web: Serve it to browsers of this computer instead of opening a window.
+    """
+    from lio_jax.commands.view import view as command
+
+    command(folder, web)
 
 
 @app.command(name="export")

@@ -43,6 +43,8 @@ class Tracked:
     """pad: copying into padded arrays; step: transfer, estimation and the way back; total: their sum."""
     failure: str
     """What went wrong with this scan, or nothing."""
+    scan: Scan | None = None
+    """The scan as the step took it: padded host arrays, not compensated."""
 
 
 class CompiledStep:
@@ -117,6 +119,7 @@ def track(
             scan_points=fed.count,
             stage_ms={"pad": fed.pad_ms, "step": step_ms, "total": fed.pad_ms + step_ms},
             failure=failure,
+            scan=fed.scan,
         )
 
 
