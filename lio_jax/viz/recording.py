@@ -133,7 +133,7 @@ class Recording:
             if raw is not None:
                 self._log_points(RAW, raw, _RAW_COLOUR)
             if corners is not None:
-                self._log_points("world/lidar/corners", points[corners], _CORNER_COLOUR, -3.0)
+                self._log_points("world/lidar/corners", points[corners], _CORNER_COLOUR, -2.5)
                 self._log_points("world/lidar/surfaces", points[~corners], _SURFACE_COLOUR, -2.0)
         self._positions.append(T_world_lidar[:3, 3].astype(np.float32))
         if len(self._positions) >= max(

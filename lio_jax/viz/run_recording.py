@@ -23,8 +23,7 @@ class RecordingObserver:
         recording, index, stamp_ns = self._recording, tracked.index, tracked.stamp_ns
         T_world_lidar = tracked.T_world_imu @ pose_matrix(tracked.nav.T_imu_lidar.wxyz_xyz)
         points, corners = _compensated(tracked, T_world_lidar)
-        raw = _raw(tracked) if recording.shows_cloud(index) else None
-        recording.log_scan(index, stamp_ns, points, T_world_lidar, raw, corners)
+        recording.log_scan(index, stamp_ns, points, T_world_lidar, tracked.raw, corners)
         recording.log_added(index, stamp_ns, new_map_points(tracked))
         if np.isfinite(T_world_lidar).all():
             recording.log_pose(index, stamp_ns, "world/imu", tracked.T_world_imu)
@@ -48,14 +47,6 @@ def _compensated(
     offset = np.asarray(output.origin) - T_world_lidar[:3, 3]
     in_lidar = ((points[kept] + offset) @ T_world_lidar[:3, :3]).astype(np.float32)
     return in_lidar, None if output.corners is None else np.asarray(output.corners)[kept]
-
-
-def _raw(tracked: Tracked) -> NDArray[np.float32] | None:
-    """Return the scan as it was recorded, in the lidar frame of each point's own firing."""
-    if tracked.scan is None:
-        return None
-    points = np.asarray(tracked.scan.points)[np.asarray(tracked.scan.mask)]
-    return points[:: max(1, len(points) // _POINTS)]
 
 
 def _match(tracked: Tracked) -> dict[str, NDArray[np.float64]]:
