@@ -78,7 +78,10 @@ def _biases(tracked: Tracked) -> dict[str, NDArray[np.float64]]:
 
 def _unobserved(tracked: Tracked, T_world_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (k, 3) open directions in the lidar frame: of the position, or the axis of a turn."""
-    weak = weak_directions(tracked.output.registration) if tracked.index else np.zeros((6, 0))
+    found = tracked.output.registration
+    # the first scan has nothing to be matched with
+    told = tracked.index > 0 and np.isfinite(np.asarray(found.information)).all()
+    weak = weak_directions(found) if told else np.zeros((6, 0))
     turns, moves = weak[:3], weak[3:]
     stronger = np.where(np.linalg.norm(moves, axis=0) >= np.linalg.norm(turns, axis=0), moves, turns)
     return (T_world_lidar[:3, :3].T @ stronger).T
