@@ -80,16 +80,22 @@ def inspect(
     data: Data,
     set_: Assignments = (),
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    write_config: Annotated[Path | None, arg(metavar="FILE")] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Say what is in a recording, what is wrong with it and which settings fit.
 
     Args:
         data: Recording: KITTI folder, ROS bag or native folder.
         json: Print one JSON object instead of a table.
+        write_config: Write the settings that fit, for --recipe of lio-jax run.
+        overwrite: Replace that file.
     """
     from lio_jax.commands.inspect import inspect as command
+    from lio_jax.commands.runtime import prepare_jax
 
-    command(data, set_, json)
+    prepare_jax()
+    command(data, set_, json, write_config, overwrite)
 
 
 @app.command(name="run")
@@ -102,6 +108,7 @@ def run(
     scans: Annotated[int | None, arg(metavar="N")] = None,
     gt: Annotated[Path | None, arg(metavar="FILE")] = None,
     overwrite: Overwrite = False,
+    live: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> None:
     """Estimate trajectory and map of a recording.
 
@@ -113,12 +120,13 @@ def run(
         scans: How many scans; None means all.
         gt: Ground truth of T_world_imu (TUM, run folder or recording); None means the recording's own.
         overwrite: Replace the results of an earlier run in that folder.
+        live: Show it in a browser of this computer while it runs.
     """
     from lio_jax.commands.run import run as command
     from lio_jax.commands.runtime import prepare_jax
 
     prepare_jax()
-    command(data, recipe, set_, out, start, scans, gt, overwrite)
+    command(data, recipe, set_, out, start, scans, gt, overwrite, live)
 
 
 @app.command(name="eval")
@@ -137,6 +145,38 @@ def evaluate(
     from lio_jax.commands.evaluate import evaluate as command
 
     command(estimate, reference, json)
+
+
+@app.command(name="report")
+def report(
+    folders: Positional[Annotated[tuple[Path, ...], arg(metavar="DIR [DIR ...]")]],
+    out: Annotated[Path | None, arg(metavar="FILE")] = None,
+) -> None:
+    """Draw a run's report anew, or compare several runs on one page.
+
+    Args:
+        folders: Folders that lio-jax run wrote.
+        out: HTML file; None means report.html in the one folder.
+    """
+    from lio_jax.commands.report import report as command
+
+    command(folders, out)
+
+
+@app.command(name="view")
+def view(
+    folder: Positional[Annotated[Path, arg(metavar="DIR")]],
+    web: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+) -> None:
+    """Open a run's recording: clouds, map, trajectory and what the estimator knew, over time.
+
+    Args:
+        folder: Folder that lio-jax run wrote, or an .rrd.
+        web: Serve it to browsers of this computer instead of opening a window.
+    """
+    from lio_jax.commands.view import view as command
+
+    command(folder, web)
 
 
 @app.command(name="export")

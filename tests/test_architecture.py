@@ -27,6 +27,7 @@ FLOORS = {
     "evaluation": 6,
     "tuning": 6,
     "ablation": 6,
+    "inspection": 6,
     "viz": 6,
     "commands": 7,
     "cli": 7,

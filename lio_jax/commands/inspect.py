@@ -3,14 +3,24 @@
 import json
 from pathlib import Path
 
+from lio_jax.commands.runtime import say
+from lio_jax.core.errors import UsageError
+from lio_jax.core.files import atomic_path
 from lio_jax.core.settings import Settings, with_overrides
-from lio_jax.data.inspect import inspect_sequence
-from lio_jax.data.inspect_table import format_inspection
 from lio_jax.data.open import open_sequence
+from lio_jax.inspection import format_inspection, inspect_sequence, settings_text
 
 
-def inspect(data: Path, assignments: tuple[str, ...], as_json: bool) -> None:
-    """Print what was found as a table, or as one JSON object."""
+def inspect(
+    data: Path, assignments: tuple[str, ...], as_json: bool, config: Path | None, overwrite: bool
+) -> None:
+    """Print what was found as a table, or as one JSON object; write the settings that fit."""
+    if config is not None and config.exists() and not overwrite:
+        raise UsageError(f"{config}: exists; choose another file or add --overwrite.")
     settings = with_overrides(Settings(), assignments)
-    inspection = inspect_sequence(open_sequence(data, settings.config.data))
-    print(json.dumps(inspection.to_dict(), allow_nan=False) if as_json else format_inspection(inspection))
+    found = inspect_sequence(open_sequence(data, settings.config.data), settings)
+    print(json.dumps(found.to_dict(), allow_nan=False) if as_json else format_inspection(found))
+    if config is not None:
+        with atomic_path(config) as aside:
+            aside.write_text(settings_text(found))
+        say(f"note: {config}: for lio-jax run {data} --recipe {config}")

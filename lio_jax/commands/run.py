@@ -9,15 +9,16 @@ from tqdm import tqdm
 
 from lio_jax.commands.runtime import say
 from lio_jax.core.errors import LioJaxError, UsageError
+from lio_jax.core.files import atomic_path
 from lio_jax.core.settings import Settings, load_settings, recipe_settings, with_overrides
 from lio_jax.data.open import open_sequence
 from lio_jax.data.sequence import Sequence
-from lio_jax.data.trajectory import Trajectory
+from lio_jax.data.trajectory import Trajectory, write_tum
 from lio_jax.recipes import recipe_named
 from lio_jax.run.folder import run_folder, write_json
 from lio_jax.run.run import Observer, RunResult, check_start, run_sequence, settings_for
-from lio_jax.run.track import Tracked, pose_matrix
 from lio_jax.viz.recording import Recording
+from lio_jax.viz.run_recording import RecordingObserver
 
 
 def resolve_settings(recipe: str, assignments: tuple[str, ...]) -> Settings:
@@ -41,6 +42,7 @@ def run(
     scans: int | None,
     gt: Path | None,
     overwrite: bool,
+    live: bool = False,
 ) -> None:
     """Run one recording from the command line."""
     if start < 0 or (scans is not None and scans < 1):
@@ -48,7 +50,9 @@ def run(
     settings = resolve_settings(recipe, assignments)
     sequence = open_sequence(data, settings.config.data)
     truth = truth_of(sequence, gt)
-    run_and_report(sequence, settings, out, start, scans, truth, overwrite)
+    if live and not settings.config.output.recording:
+        raise UsageError("--live shows the recording, and config.output.recording=false leaves it out.")
+    run_and_report(sequence, settings, out, start, scans, truth, overwrite, live)
 
 
 def run_and_report(
@@ -59,6 +63,7 @@ def run_and_report(
     count: int | None,
     truth: Trajectory | None,
     overwrite: bool,
+    live: bool = False,
 ) -> RunResult:
     """Run a recording into a folder, evaluate against truth, draw, and say what came out.
 
@@ -68,7 +73,7 @@ def run_and_report(
     """
     check_start(sequence, start)
     with run_folder(out, overwrite):
-        return run_into(sequence, settings, out, start, count, truth)
+        return run_into(sequence, settings, out, start, count, truth, live)
 
 
 def run_into(
@@ -78,6 +83,7 @@ def run_into(
     start: int,
     count: int | None,
     truth: Trajectory | None,
+    live: bool = False,
 ) -> RunResult:
     """Run a recording into an empty folder; see :func:`run_and_report`."""
     settings, notes = settings_for(sequence, settings)
@@ -90,17 +96,17 @@ def run_into(
         observers: list[Observer] = []
         recording = None
         if settings.config.output.recording:
-            recording = stack.enter_context(Recording(out / "recording.rrd", total))
+            address = _live_viewer(stack) if live else None
+            recording = stack.enter_context(Recording(out / "recording.rrd", total, address))
             observers.append(RecordingObserver(recording))
         bar = stack.enter_context(tqdm(total=total, unit="scan", disable=None, leave=False))
         observers.append(lambda tracked, scan_ms: _advance(bar))
         result = run_sequence(sequence, settings, out, start, count, observers)
         if isinstance(result.interruption, KeyboardInterrupt):
             say("interrupted: finishing the files of what was computed ...")
-        if recording and result.map_points is not None:
-            recording.log_map(result.map_points)
         if recording and truth is not None:
             recording.log_truth(_in_world_of(result.trajectory, truth).positions)
+    result.metrics["notes"] = [*sequence.info.notes, *notes]
     evaluation_text = _finish(result, truth, settings, out, info.name)
     _warn(result.metrics["warnings"])
     _warn([failure["message"] for failure in result.metrics["failures"]])
@@ -121,35 +127,13 @@ def _warn(sentences: list[str]) -> None:
         say(f"warning: {hidden} more of these; metrics.json lists them all.")
 
 
-class RecordingObserver:
-    """Writes every scan, thinned, into a recording."""
+def _live_viewer(stack: ExitStack) -> str:
+    """Serve a viewer for as long as the run goes on, and return where to send it what is computed."""
+    from lio_jax.viz.viewer import served
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-
-    def __call__(self, tracked: Tracked, scan_ms: float) -> None:
-        """Log the motion-compensated scan at its pose."""
-        output, registration = tracked.output, tracked.output.registration
-        T_world_lidar = tracked.T_world_imu @ pose_matrix(tracked.nav.T_imu_lidar.wxyz_xyz)
-        points = np.asarray(output.points)
-        kept = slice(None, None, max(1, len(points) // _RECORDED_POINTS))
-        points = points[kept][np.asarray(output.points_mask)[kept]]
-        offset = np.asarray(output.origin) - T_world_lidar[:3, 3]
-        in_lidar = ((points + offset) @ T_world_lidar[:3, :3]).astype(np.float32)
-        self._recording.log_scan(tracked.index, tracked.stamp_ns, in_lidar, T_world_lidar)
-        self._recording.log_metrics(
-            tracked.index,
-            tracked.stamp_ns,
-            {
-                "scan_ms": scan_ms,
-                "matches": float(registration.matches),
-                "rmse_m": float(registration.rmse),
-                "iterations": float(registration.iterations),
-            },
-        )
-
-
-_RECORDED_POINTS = 5000
+    server = stack.enter_context(served())
+    say(f"live: open {server.page}")
+    return server.stream
 
 
 def _advance(bar: Any) -> None:
@@ -173,9 +157,10 @@ def truth_of(sequence: Sequence, gt: Path | None) -> Trajectory | None:
 
 
 def _finish(result: RunResult, truth: Trajectory | None, settings: Settings, out: Path, name: str) -> str:
-    """Add the errors against truth to metrics.json, draw, and return the errors as a table."""
+    """Add notes and errors against truth to the folder, draw, and return the errors as a table."""
     text = ""
     if truth is not None:
+        from lio_jax.evaluation.association import match_by_time
         from lio_jax.evaluation.evaluate import evaluate
         from lio_jax.evaluation.report import format_evaluation
 
@@ -184,26 +169,35 @@ def _finish(result: RunResult, truth: Trajectory | None, settings: Settings, out
         except LioJaxError as error:
             say(f"warning: no comparison with the truth: {error}")
         else:
-            result.metrics |= evaluation.as_dict()
-            write_json(out / "metrics.json", result.metrics)
+            # the evaluation has notes of its own
+            noted = [*result.metrics["notes"], *evaluation.notes]
+            result.metrics |= evaluation.as_dict() | {"notes": noted}
             text = format_evaluation(evaluation)
+            with atomic_path(out / "truth.tum") as aside:
+                write_tum(aside, match_by_time(result.trajectory, truth).reference)
+    write_json(out / "metrics.json", result.metrics)
     if settings.config.output.plot:
         from lio_jax.viz.plot import plot_timings, plot_trajectory
 
         plot_trajectory(out / "trajectory.png", result.trajectory, truth, name)
         stages = {name: ms for name, ms in result.stage_ms.items() if ms and name != "total"}
         plot_timings(out / "timings.png", stages)
+    if settings.config.output.report:
+        from lio_jax.viz.report import write_report
+
+        write_report(out)
     return text
 
 
 def _in_world_of(estimate: Trajectory, truth: Trajectory) -> Trajectory:
-    """Move the truth so that it agrees with the estimate at the first instant both have."""
+    """Return the truth of the run, moved to agree with the estimate at the first instant both have."""
     common = truth.at(estimate.stamp_ns)
     if not len(common):
         return truth
     first = int(np.searchsorted(estimate.stamp_ns, common.stamp_ns[0]))
     T_estimate_truth = estimate.poses[first] @ np.linalg.inv(common.poses[0])
-    return Trajectory(truth.stamp_ns, T_estimate_truth @ truth.poses)
+    within = (truth.stamp_ns >= estimate.stamp_ns[0]) & (truth.stamp_ns <= estimate.stamp_ns[-1])
+    return Trajectory(truth.stamp_ns[within], T_estimate_truth @ truth.poses[within])
 
 
 def _summary(result: RunResult, out: Path) -> str:

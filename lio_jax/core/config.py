@@ -179,6 +179,8 @@ class OutputConfig:
     """Write recording.rrd."""
     plot: bool = True
     """Write trajectory.png and timings.png."""
+    report: bool = True
+    """Write report.html."""
     keyframe_distance: float = 1.0
     """A scan this far from the last keyframe becomes one, m."""
     keyframe_angle: float = 0.2

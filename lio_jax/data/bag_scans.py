@@ -72,7 +72,7 @@ class ScanReading:
             points, intensity, ring = points[keep], intensity[keep], ring[keep]
         if len(points) == 0:
             warn(f"{name} ({ns_to_seconds(start_ns)} s) holds no points.")
-        return LidarScan(start_ns, points, time, ring, intensity, duration)
+        return LidarScan(start_ns, points, time, ring, intensity, duration, cloud.dropped)
 
     def _times(
         self, cloud: RawCloud, name: str, warn: Callable[[str], None]

@@ -18,6 +18,24 @@ class Topic:
     """Number of messages."""
 
 
+@dataclass(frozen=True)
+class BagContents:
+    """What a bag says about itself without any scan being decoded."""
+
+    topics: tuple[Topic, ...]
+    lidar: Topic
+    """The topic whose clouds are read."""
+    imu: Topic | None
+    point_fields: tuple[str, ...]
+    """Name and type of the fields of a point, as the first cloud has them."""
+    size_bytes: int
+    """Of all its files."""
+    start_ns: int
+    """When its first message was received."""
+    end_ns: int
+    """When its last message was received."""
+
+
 def bag_topics(connections: Iterable[Any]) -> tuple[Topic, ...]:
     """Sum a bag's connections by topic and type, in order of name."""
     counts: dict[tuple[str, str], int] = {}

@@ -27,6 +27,11 @@ def keep_by_tag(tag: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return (bits == 0x10) | (bits == 0x00)
 
 
+def field_names() -> tuple[str, ...]:
+    """Return name and type of a CustomMsg's point, such as "x f4"."""
+    return tuple(f"{name} {form}" for name, form in zip(_POINT_FIELDS, _POINT_FORMATS, strict=True))
+
+
 def decode_custom_msg(raw: bytes, ros2: bool) -> RawCloud:
     """Decode a serialised CustomMsg of any Livox driver; times are uint32 ns from the header stamp.
 

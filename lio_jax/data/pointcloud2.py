@@ -95,6 +95,11 @@ def decode_pointcloud2(message: Any, *, time_field: str = "", where: str = "Poin
     )
 
 
+def field_names(message: Any) -> tuple[str, ...]:
+    """Return name and type of a PointCloud2's fields, such as "x f4"."""
+    return tuple(f"{field.name} {_SCALARS.get(field.datatype, '?')}" for field in message.fields)
+
+
 def _first(candidates: Sequence[str], by_lower: dict[str, str]) -> str:
     return next((by_lower[name] for name in candidates if name in by_lower), "")
 

@@ -29,6 +29,8 @@ class RawCloud:
     """Name of the time field, "" where there is none."""
     time_range: tuple[float, float] | tuple[int, int] | None
     """Least and greatest tick of the message, firings without a return included."""
+    dropped: int = 0
+    """Number of recorded points that are no returns."""
 
 
 def assemble(
@@ -68,6 +70,7 @@ def assemble(
         None if time is None else time[chosen],
         time_field,
         None if time is None else _time_range(time, valid),
+        len(valid) - len(points),
     )
 
 

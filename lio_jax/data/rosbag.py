@@ -1,6 +1,8 @@
 """Read ROS 1 and ROS 2 bags as a Sequence: clouds streamed, inertial and GPS samples gathered in one pass."""
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +11,7 @@ from lio_jax.core.errors import LioJaxError
 from lio_jax.data import gps_messages, imu_messages, livox, pointcloud2
 from lio_jax.data.bag_files import bag_paths, open_bag, until_damage
 from lio_jax.data.bag_scans import decode_cloud, recognise_scans
-from lio_jax.data.bag_topics import Topic, bag_topics, choose_topic, listed
+from lio_jax.data.bag_topics import BagContents, Topic, bag_topics, choose_topic, listed
 from lio_jax.data.gps_messages import GpsCollector
 from lio_jax.data.imu_messages import ImuCollector
 from lio_jax.data.imu_units import accel_scale
@@ -45,13 +47,14 @@ class RosbagSequence:
         self._paths = bag_paths(path)
         self._warnings = WarningLog()
         self._samples: tuple[ImuData | None, GpsData | None] | None = None
+        self._received: tuple[int | None, int | None] = (None, None)
         with open_bag(self._paths) as reader:
             topics = bag_topics(reader.connections)
             self._notes = [f"{len(self._paths)} files read as one recording"] if len(self._paths) > 1 else []
             self._lidar = self._choose_lidar(topics)
             self._imu_topic = self._choose("imu_topic", config.imu_topic, topics, _IMU_TYPES)
             self._gps_topic = self._choose_gps(topics)
-            messages = until_damage(_messages(reader, self._lidar), lambda reason: None)
+            messages = until_damage(self._messages(reader, self._lidar), lambda reason: None)
             self._reading = recognise_scans(reader, self._lidar, messages, config, self._where)
         self._notes.extend(self._reading.notes)
 
@@ -94,6 +97,39 @@ class RosbagSequence:
                     continue
                 scan = self._reading.scan(cloud, name, self._warnings.add)
                 yield Stamped(scan.stamp_ns, name, scan)
+
+    def within(self, start_ns: int, end_ns: int) -> "RosbagSequence":
+        """Return the part whose messages were received from ``start_ns`` up to ``end_ns``.
+
+        It is found by the bag's index, without reading what lies before. Its scans count from 0;
+        ``info.scan_count`` is still the whole bag's.
+        """
+        part = copy(self)
+        part._received, part._samples, part._warnings = (start_ns, end_ns), None, WarningLog()
+        part._notes = list(self._notes)
+        return part
+
+    def contents(self) -> BagContents:
+        """Return what the bag says about itself; only its first cloud is looked at."""
+        fields: tuple[str, ...] = ()
+        with open_bag(self._paths) as reader:
+            for _, raw in self._lidar_messages(reader):
+                if self._lidar.type in livox.TYPES:
+                    fields = livox.field_names()
+                else:
+                    # a damaged message was reported where it is decoded
+                    with suppress(Exception):
+                        fields = pointcloud2.field_names(reader.deserialize(raw, self._lidar.type))
+                break
+            return BagContents(
+                topics=bag_topics(reader.connections),
+                lidar=self._lidar,
+                imu=self._imu_topic,
+                point_fields=fields,
+                size_bytes=sum(_size(path) for path in self._paths),
+                start_ns=reader.start_time,
+                end_ns=reader.end_time,
+            )
 
     def header_stamps(self) -> Iterator[int]:
         """Yield the header stamp in ns of every cloud without decoding any."""
@@ -161,7 +197,7 @@ class RosbagSequence:
                 "reading ended there."
             )
 
-        for number, (_, _, raw) in enumerate(until_damage(_messages(reader, self._lidar), broken)):
+        for number, (_, _, raw) in enumerate(until_damage(self._messages(reader, self._lidar), broken)):
             last = number
             yield number, raw
 
@@ -184,7 +220,7 @@ class RosbagSequence:
                 gps_type = self._gps_topic.type
                 take[self._gps_topic.name] = lambda raw: gps.add(reader.deserialize(raw, gps_type))
             unreadable = dict.fromkeys(take, 0)
-            for connection, _, raw in until_damage(_messages(reader, *topics), broken):
+            for connection, _, raw in until_damage(self._messages(reader, *topics), broken):
                 try:
                     take[connection.topic](raw)
                 # The generated decoders raise struct, index or their own errors on damaged bytes.
@@ -213,7 +249,13 @@ class RosbagSequence:
         self._notes.extend(notes)
         return gps
 
+    def _messages(self, reader: "AnyReader", *topics: Topic) -> Iterator[tuple[Any, int, bytes]]:
+        wanted = {(topic.name, topic.type) for topic in topics}
+        connections = [c for c in reader.connections if (c.topic, c.msgtype) in wanted]
+        start, stop = self._received
+        return reader.messages(connections, start=start, stop=stop)
 
-def _messages(reader: "AnyReader", *topics: Topic) -> Iterator[tuple[Any, int, bytes]]:
-    wanted = {(topic.name, topic.type) for topic in topics}
-    return reader.messages([c for c in reader.connections if (c.topic, c.msgtype) in wanted])
+
+def _size(path: Path) -> int:
+    files = [path] if path.is_file() else path.iterdir()
+    return sum(file.stat().st_size for file in files if file.is_file())

@@ -30,6 +30,8 @@ class LidarScan:
     """(n,) as the sensor reports it."""
     duration: float
     """s from scan start to scan end; 0 for a sweep that is already motion compensated."""
+    dropped: int = 0
+    """Number of firings that were recorded without a return: NaN, infinite or zero."""
 
     @property
     def end_ns(self) -> int:

@@ -53,17 +53,52 @@ def segment_errors(
         lengths_m: segment lengths, m.
         step: frames between two starts.
     """
-    travelled = np.concatenate(
-        [[0.0], np.cumsum(np.linalg.norm(np.diff(reference[:, :3, 3], axis=0), axis=1))]
-    )
     starts = np.arange(0, len(reference), step)
     lengths = np.asarray(lengths_m, np.float64)
-    ends = np.searchsorted(travelled, travelled[starts][:, None] + lengths, side="right")
+    ends = segment_ends(reference, starts, lengths)
     start_row, length_column = np.nonzero(ends < len(reference))
     if start_row.size == 0:
         return None
-    first, last = starts[start_row], ends[start_row, length_column]
     length = lengths[length_column]
+    translation, angle = relative_errors(
+        estimate, reference, starts[start_row], ends[start_row, length_column]
+    )
+    return SegmentErrors(
+        translation_percent=float(100.0 * np.mean(translation / length)),
+        rotation_deg_per_m=float(np.mean(np.degrees(angle) / length)),
+        segments=int(start_row.size),
+    )
+
+
+def segment_ends(
+    reference: NDArray[np.float64], starts: NDArray[np.int64], lengths_m: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Return (s, l) frames at which segments of given lengths end; n where the path is too short.
+
+    Args:
+        reference: (n, 4, 4).
+        starts: (s,) frames.
+        lengths_m: (l,) along the reference, m.
+    """
+    steps = np.linalg.norm(np.diff(reference[:, :3, 3], axis=0), axis=1)
+    travelled = np.concatenate([[0.0], np.cumsum(steps)])
+    return np.searchsorted(travelled, travelled[starts][:, None] + lengths_m, side="right")
+
+
+def relative_errors(
+    estimate: NDArray[np.float64],
+    reference: NDArray[np.float64],
+    first: NDArray[np.int64],
+    last: NDArray[np.int64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return by how much the motion from frames ``first`` to ``last`` is wrong, (p,) m and (p,) rad.
+
+    Args:
+        estimate: (n, 4, 4) T_world_body.
+        reference: (n, 4, 4), poses of the same instants and the same body frame; the worlds may differ.
+        first: (p,) frames.
+        last: (p,) frames.
+    """
     # True inverses, not transposes: published truth is rounded text and not exactly orthonormal.
     inverse_estimate, inverse_reference = np.linalg.inv(estimate), np.linalg.inv(reference)
     error = (inverse_estimate[last] @ estimate[first]) @ (inverse_reference[first] @ reference[last])
@@ -71,8 +106,4 @@ def segment_errors(
     # gives the same angle without that.
     chord = np.linalg.norm(error[:, :3, :3] - np.eye(3), axis=(1, 2))
     angle = 2.0 * np.arcsin(np.clip(chord / np.sqrt(8.0), 0.0, 1.0))
-    return SegmentErrors(
-        translation_percent=float(100.0 * np.mean(np.linalg.norm(error[:, :3, 3], axis=1) / length)),
-        rotation_deg_per_m=float(np.mean(np.degrees(angle) / length)),
-        segments=int(first.size),
-    )
+    return np.linalg.norm(error[:, :3, 3], axis=1), angle

@@ -186,6 +186,7 @@ def step(
         origin=frames.surface.origin,
         thinned_away=thinned_away + features.dropped,
         map_dropped=added[0].dropped + added[1].dropped,
+        corners=jnp.arange(len(placed.corner_mask) + len(placed.surface_mask)) < len(placed.corner_mask),
     )
 
 

@@ -44,6 +44,8 @@ class Output(eqx.Module):
     """Occupied cells of the scan beyond its capacities: they thin the scan further, evenly."""
     map_dropped: Int32[Array, ""]
     """Points whose voxel found no room in the map."""
+    corners: Bool[Array, " m"] | None = None
+    """Which of ``points`` are corners, the others being surfaces; None from recipes without features."""
     covariance: Float[Array, "24 24"] | None = None
     """Of the navigation state's error; None from recipes that carry none."""
     evidence: Evidence | None = None

@@ -22,17 +22,8 @@ def unobserved_directions(registration: Any, nav: Any) -> list[str]:
         registration: a scan match whose degenerate directions hold no information, or the least.
         nav: navigation state at the scan's end.
     """
-    missing = int(np.sum(registration.degenerate))
-    R_world_lidar = Rotation.from_quat(
-        np.asarray(registration.T_world_lidar.wxyz_xyz)[:4], scalar_first=True
-    ).as_matrix()
-    to_world = np.kron(np.eye(2), R_world_lidar)
-    information = to_world @ np.asarray(registration.information, np.float64) @ to_world.T
-    # rotations in metres of a typical point, so that the six directions compare
-    arm = np.sqrt(np.trace(information[:3, :3]) / max(np.trace(information[3:, 3:]), 1e-300)) + 1e-6
-    scale = np.repeat([1 / arm, 1.0], 3)
-    _, vectors = np.linalg.eigh(scale[:, None] * information * scale)
-    weak = vectors[:, :missing]
+    weak = weak_directions(registration)
+    missing = weak.shape[1]
 
     heading, name = _heading(nav)
     axes = np.stack([heading, np.cross([0.0, 0.0, 1.0], heading), [0.0, 0.0, 1.0]])
@@ -47,6 +38,23 @@ def unobserved_directions(registration: Any, nav: Any) -> list[str]:
                 named.append(word)
                 weak = _without(weak, np.concatenate([axis * (row == 0), axis * (row == 3)]))
     return named + [_components(vector) for vector in weak.T[: missing - len(named)]]
+
+
+def weak_directions(registration: Any) -> NDArray[np.float64]:
+    """Return the (6, k) directions a scan match does not observe, rotation before translation, in world axes.
+
+    Rotations are scaled to metres of a typical point, so that the six compare.
+    """
+    missing = int(np.sum(registration.degenerate))
+    R_world_lidar = Rotation.from_quat(
+        np.asarray(registration.T_world_lidar.wxyz_xyz)[:4], scalar_first=True
+    ).as_matrix()
+    to_world = np.kron(np.eye(2), R_world_lidar)
+    information = to_world @ np.asarray(registration.information, np.float64) @ to_world.T
+    arm = np.sqrt(np.trace(information[:3, :3]) / max(np.trace(information[3:, 3:]), 1e-300)) + 1e-6
+    scale = np.repeat([1 / arm, 1.0], 3)
+    _, vectors = np.linalg.eigh(scale[:, None] * information * scale)
+    return vectors[:, :missing]
 
 
 def _heading(nav: Any) -> tuple[NDArray[np.float64], str]:

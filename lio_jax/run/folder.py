@@ -15,6 +15,8 @@ RUN_FILES = (
     "trajectory_kitti.txt",
     "imu_rate.tum",
     "states.npz",
+    "scans.npz",
+    "truth.tum",
     "map.pcd",
     "keyframes.g2o",
     "metrics.json",
@@ -22,6 +24,7 @@ RUN_FILES = (
     "recording.rrd",
     "trajectory.png",
     "timings.png",
+    "report.html",
 )
 """What a run may write."""
 

@@ -21,12 +21,14 @@ from lio_jax.data.prefetch import prefetched
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.data.trajectory import Trajectory, write_kitti_poses, write_tum
 from lio_jax.loops.g2o import write_g2o
+from lio_jax.run.environment import environment
 from lio_jax.run.folder import write_json, write_text
 from lio_jax.run.imu_feed import OFFSET_MARGIN_S, ImuFeed
 from lio_jax.run.imu_rate import write_imu_rate
 from lio_jax.run.keyframes import keyframe_indices, odometry_edges
 from lio_jax.run.map_file import MapFile
 from lio_jax.run.overflow import Overflow
+from lio_jax.run.scan_log import ScanLog
 from lio_jax.run.sensor_sizes import with_sensor_sizes
 from lio_jax.run.surroundings import fitted_to_surroundings
 from lio_jax.run.track import CompiledStep, Tracked, track
@@ -109,7 +111,7 @@ def run_sequence(
     began = time.perf_counter()
     step = step or CompiledStep(settings)
     imu, imu_notes = imu_feed(sequence, settings)
-    log = TrajectoryLog()
+    log, scan_log = TrajectoryLog(), ScanLog()
     stage_ms: dict[str, list[float]] = {"decode": [], "pad": [], "step": [], "record": [], "total": []}
     failures: list[dict[str, Any]] = []
     overflow = Overflow(settings)
@@ -127,6 +129,7 @@ def run_sequence(
                         stage_ms[stage].append(value)
                     overflow.add(tracked)
                     log.append(tracked)
+                    scan_log.append(start + tracked.index, tracked)
                     if tracked.failure:
                         failures.append(failure_record(start + tracked.index, tracked))
                     if map_file:
@@ -143,12 +146,14 @@ def run_sequence(
             raise LioJaxError(f"{sequence.info.path}: no scan could be read. {reasons}".strip())
         map_points = map_file.finish() if map_file else None
         _write_trajectory(out, log, settings)
+        scan_log.write_npz(out / "scans.npz", stage_ms)
         if imu and imu.samples:
             write_imu_rate(out / "imu_rate.tum", log, imu.samples)
     finally:
         if map_file:
             map_file.close()
     metrics = {
+        "recording": _described(sequence),
         "scans": len(log),
         "prediction": "inertial samples" if imu else "constant velocity",
         "scan_ms": {stage: percentiles(values) for stage, values in stage_ms.items() if values},
@@ -163,6 +168,7 @@ def run_sequence(
             *overflow.warnings(),
         ],
         "overflow": overflow.metrics(),
+        "environment": environment(),
     }
     write_json(out / "metrics.json", metrics)
     return RunResult(log.trajectory(), metrics, stage_ms, map_points, interruption)
@@ -184,6 +190,17 @@ def imu_feed(sequence: Sequence, settings: Settings) -> tuple[ImuFeed | None, tu
     offset = settings.values["extrinsics"]["time_offset"]
     own = settings.config.imu.orientation
     return ImuFeed(imu, settings.config.imu.buckets, offset, margin, own), found
+
+
+def _described(sequence: Sequence) -> dict[str, Any]:
+    info = sequence.info
+    return {
+        "name": info.name,
+        "path": info.path,
+        "format": info.format,
+        "sensor": info.sensor,
+        "notes": list(info.notes),
+    }
 
 
 def check_start(sequence: Sequence, start: int) -> None:

@@ -43,6 +43,8 @@ class Tracked:
     """pad: copying into padded arrays; step: transfer, estimation and the way back; total: their sum."""
     failure: str
     """What went wrong with this scan, or nothing."""
+    raw: NDArray[np.float32] | None = None
+    """(k, 3) some of the points as recorded, m in the lidar frame of their own firing, for pictures."""
 
 
 class Programs:
@@ -147,6 +149,7 @@ class Judged:
             scan_points=fed.count,
             stage_ms={"pad": fed.pad_ms, "step": step_ms, "total": fed.pad_ms + step_ms},
             failure=failure,
+            raw=_some(np.asarray(fed.scan.points)[: fed.count]),
         )
 
 
@@ -232,6 +235,14 @@ def _reopened(step: Step, state: Any, first: Fed, second: Fed) -> Any:
 
 _STRAGGLER = 0.25
 """A scan with less than this share of the points of the scan before keeps that one's padded size."""
+
+
+_SHOWN_POINTS = 5000
+
+
+def _some(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return a copy of a few thousand points: whoever keeps results must not keep whole scans by them."""
+    return points[:: max(1, len(points) // _SHOWN_POINTS)].copy()
 
 
 def pose_matrix(wxyz_xyz: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,52 +1,66 @@
 """Write a run as a rerun recording (.rrd): the one place that knows rerun's API.
 
-Nothing is sent anywhere: the stream has a file as its only sink, starts no viewer and no server, and is
-never made rerun's global recording. (rerun collects usage data in its viewer and command line, not in its
-library.)
+Nothing is sent anywhere unless a viewer's address is given: else the stream has a file as its only sink. It
+starts no viewer and no server, and is never made rerun's global recording. (rerun collects usage data in its
+viewer and command line, not in its library.)
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import atomic_path
+from lio_jax.viz.blueprint import ADDED, RAW, default_blueprint
 from lio_jax.viz.colour import colour_by_height
 
 if TYPE_CHECKING:
     import rerun as rr
-    import rerun.blueprint as rrb
 
 _MAX_SCAN_POINTS = 5_000
 _MIN_SCAN_POINTS = 1_000
-_MAX_MAP_POINTS = 300_000
-# Scans take 16 bytes a point; a long recording gets fewer points a scan instead of a file nobody can open.
-_SCAN_BUDGET_BYTES = 150_000_000
-_BYTES_PER_POINT = 16
+CLOUD_BUDGET_BYTES = 150_000_000
+"""Of all scans' clouds: a long recording gets fewer points a scan, then clouds of every n-th scan only."""
+BYTES_PER_POINT = 40
+"""Of a scan: compensated with its colour, raw, and features or what is new to the map."""
+MAX_MAP_POINTS = 300_000
+_MAP_PIECES = 40
+"""The map appears in so many pieces: each stays from when it was seen."""
+_PIECE_SCANS = 50
+"""Scans of a piece where their number is not known before."""
 # The whole strip is written anew each time it has grown by this share: its bytes stay linear in the run.
 _STRIP_GROWTH = 1.03
 _STRIP_MIN_STEP = 10
 _ESTIMATE_COLOUR = (31, 119, 180)
 _TRUTH_COLOUR = (44, 160, 44)
+_RAW_COLOUR, _ADDED_COLOUR = (150, 150, 150), (230, 80, 60)
+_CORNER_COLOUR, _SURFACE_COLOUR = (214, 39, 40), (23, 190, 207)
+SIGMA_SCALE = 100.0
+"""Position sigmas are centimetres: ellipsoids are drawn so many times larger."""
+_ARROW_M = 5.0
 
 
 class Recording:
     """A context manager that writes ``path`` aside and renames it when it ends without an exception.
 
-    Entities: world/lidar (pose), world/lidar/scan, world/trajectory, world/truth, world/map, metrics/NAME.
+    Entities: world/lidar (pose), world/lidar/scan (compensated), world/lidar/raw, world/lidar/corners and
+    surfaces, world/lidar/unobserved, world/imu (pose), world/imu/position_100_sigma, world/added,
+    world/map/NN, world/trajectory, world/truth, metrics/GROUP/NAME.
     Time lines: "scan" (index) and "time" (the recording's own clock).
     """
 
-    def __init__(self, path: Path, scan_count: int | None = None) -> None:
+    def __init__(self, path: Path, scan_count: int | None = None, live: str | None = None) -> None:
         """Open the file.
 
         Args:
             path: the .rrd to be written.
             scan_count: number of scans to come where it is known; long runs get fewer points a scan.
+            live: address of a viewer's server that gets everything at once, too.
 
         Raises:
             LioJaxError: the file cannot be created.
@@ -54,25 +68,42 @@ class Recording:
         import rerun as rr
 
         self._path = path
-        self._scan_points = _MAX_SCAN_POINTS
+        self._scan_points, self._cloud_every = _MAX_SCAN_POINTS, 1
+        self._piece_scans = _PIECE_SCANS
         if scan_count:
-            affordable = _SCAN_BUDGET_BYTES // (_BYTES_PER_POINT * scan_count)
+            affordable = CLOUD_BUDGET_BYTES // (BYTES_PER_POINT * scan_count)
             self._scan_points = int(np.clip(affordable, _MIN_SCAN_POINTS, _MAX_SCAN_POINTS))
+            self._cloud_every = max(1, -(-_MIN_SCAN_POINTS // max(affordable, 1)))
+            self._piece_scans = max(1, -(-scan_count // _MAP_PIECES))
+        self._piece: list[NDArray[np.float32]] = []
+        self._piece_start, self._pieces = 0, 0
         self._positions: list[NDArray[np.float32]] = []
         self._strip_length = 0
         self._stream: rr.RecordingStream | None = rr.RecordingStream("lio_jax")
         self._file = atomic_path(path)
         try:
-            self._stream.save(self._file.__enter__(), default_blueprint=_blueprint())
+            sinks: list[Any] = [rr.FileSink(self._file.__enter__())]
+            sinks += [rr.GrpcSink(live)] if live else []
+            self._stream.set_sinks(*sinks, default_blueprint=default_blueprint())
         except Exception as error:
             self._end(error)
             raise LioJaxError(f"{path}: the recording cannot be created ({error}).") from None
         # The wall clock of the computer is no part of the result.
         self._stream.set_log_time_enabled(False)
         self._stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        # Negative radii are screen points: thin at any zoom.
-        self._stream.log("world/lidar/scan", rr.Points3D.from_fields(radii=-1.5), static=True)
-        self._stream.log("world/map", rr.Points3D.from_fields(radii=-1.0), static=True)
+
+    def shows_cloud(self, index: int) -> bool:
+        """Tell whether a scan's clouds are logged; of long recordings it is every n-th's."""
+        return index % self._cloud_every == 0
+
+    def log_pose(self, index: int, stamp_ns: int, entity: str, pose: NDArray[np.float64]) -> None:
+        """Log a frame's (4, 4) pose in world; one that is not finite is left out."""
+        import rerun as rr
+
+        stream = self._at(index, stamp_ns)
+        if np.isfinite(pose).all():
+            quaternion = rr.Quaternion(xyzw=Rotation.from_matrix(pose[:3, :3]).as_quat())
+            stream.log(entity, rr.Transform3D(translation=pose[:3, 3], quaternion=quaternion))
 
     def log_scan(
         self,
@@ -80,28 +111,30 @@ class Recording:
         stamp_ns: int,
         points: NDArray[np.float32],
         T_world_lidar: NDArray[np.float64],
+        raw: NDArray[np.float32] | None = None,
+        corners: NDArray[np.bool_] | None = None,
     ) -> None:
         """Log one scan and its pose; the trajectory strip grows with it.
 
         Args:
             index: of the scan.
             stamp_ns: absolute time of the pose, ns.
-            points: (n, 3) m in the lidar frame, thinned here; colour shows the height over the sensor.
+            points: (n, 3) m in the lidar frame, compensated; thinned here, colour shows the height.
             T_world_lidar: (4, 4); a scan whose pose is not finite is left out.
+            raw: (m, 3) m as recorded.
+            corners: (n,) which of ``points`` are corners, the others being surfaces.
         """
-        import rerun as rr
-
-        stream = self._at(index, stamp_ns)
         if not np.isfinite(T_world_lidar).all():
             return
-        quaternion = Rotation.from_matrix(T_world_lidar[:3, :3]).as_quat()
-        stream.log(
-            "world/lidar",
-            rr.Transform3D(translation=T_world_lidar[:3, 3], quaternion=rr.Quaternion(xyzw=quaternion)),
-        )
-        thinned = _thinned(points, self._scan_points)
-        heights = thinned @ T_world_lidar[2, :3].astype(np.float32)
-        stream.log("world/lidar/scan", rr.Points3D(thinned, colors=colour_by_height(heights, -2.0, 8.0)))
+        self.log_pose(index, stamp_ns, "world/lidar", T_world_lidar)
+        if self.shows_cloud(index):
+            heights = points @ T_world_lidar[2, :3].astype(np.float32)
+            self._log_points("world/lidar/scan", points, colour_by_height(heights, -2.0, 8.0))
+            if raw is not None:
+                self._log_points(RAW, raw, _RAW_COLOUR)
+            if corners is not None:
+                self._log_points("world/lidar/corners", points[corners], _CORNER_COLOUR, -2.5)
+                self._log_points("world/lidar/surfaces", points[~corners], _SURFACE_COLOUR, -2.0)
         self._positions.append(T_world_lidar[:3, 3].astype(np.float32))
         if len(self._positions) >= max(
             self._strip_length * _STRIP_GROWTH, self._strip_length + _STRIP_MIN_STEP
@@ -109,25 +142,47 @@ class Recording:
             self.log_trajectory(np.array(self._positions))
             self._strip_length = len(self._positions)
 
-    def log_metrics(self, index: int, stamp_ns: int, values: dict[str, float]) -> None:
-        """Log scalars of a scan as metrics/NAME (for example scan_ms)."""
+    def log_added(self, index: int, stamp_ns: int, points: NDArray[np.float32]) -> None:
+        """Log the (n, 3) points that a scan adds to the map, m in world; the map grows by them in pieces."""
+        self._at(index, stamp_ns)
+        if index - self._piece_start >= self._piece_scans:
+            self._log_piece()
+            self._piece_start = index
+        # thinned as they come, so that a piece's memory is bounded too
+        limit = max(1, MAX_MAP_POINTS // (_MAP_PIECES * self._piece_scans))
+        self._piece.append(_thinned(points, limit))
+        if self.shows_cloud(index):
+            self._log_points(ADDED, points, _ADDED_COLOUR)
+
+    def log_sigma(self, covariance: NDArray[np.float64]) -> None:
+        """Log the (3, 3) covariance of the position at the last logged scan, m^2 in IMU axes, enlarged."""
+        import rerun as rr
+
+        if not np.isfinite(covariance).all():
+            return
+        variances, axes = np.linalg.eigh(covariance)
+        axes[:, 0] *= np.sign(np.linalg.det(axes))
+        sizes = SIGMA_SCALE * np.sqrt(np.maximum(variances, 0.0))
+        quaternion = rr.Quaternion(xyzw=Rotation.from_matrix(axes).as_quat())
+        self._open_stream().log(
+            f"world/imu/position_{SIGMA_SCALE:.0f}_sigma",
+            rr.Ellipsoids3D(half_sizes=[sizes], quaternions=[quaternion], colors=[_ESTIMATE_COLOUR]),
+        )
+
+    def log_unobserved(self, directions: NDArray[np.float64]) -> None:
+        """Log the (k, 3) directions in the lidar frame that the last logged scan leaves open; none clears."""
+        import rerun as rr
+
+        arrows = rr.Arrows3D(vectors=_ARROW_M * directions, colors=[_ADDED_COLOUR] * len(directions))
+        self._open_stream().log("world/lidar/unobserved", arrows)
+
+    def log_metrics(self, index: int, stamp_ns: int, values: Mapping[str, ArrayLike]) -> None:
+        """Log scalars of a scan, or several of one name, as metrics/NAME (for example times/step)."""
         import rerun as rr
 
         stream = self._at(index, stamp_ns)
         for name, value in values.items():
-            stream.log(f"metrics/{name}", rr.Scalars(float(value)))
-
-    def log_map(self, points: NDArray[np.float32], *, static: bool = True) -> None:
-        """Log (n, 3) map points in world, thinned to what a viewer takes.
-
-        Static points are shown at every time (the final map); otherwise from the last logged scan on.
-        """
-        import rerun as rr
-
-        thinned = _thinned(points, _MAX_MAP_POINTS)
-        low, high = np.percentile(thinned[:, 2], [2.0, 98.0]) if len(thinned) else (0.0, 1.0)
-        colours = colour_by_height(thinned[:, 2], float(low), float(high))
-        self._open_stream().log("world/map", rr.Points3D(thinned, colors=colours), static=static)
+            stream.log(f"metrics/{name}", rr.Scalars(np.asarray(value, np.float64)))
 
     def log_trajectory(self, positions: NDArray[np.floating]) -> None:
         """Log the (n, 3) positions in world as they are known at the last logged scan."""
@@ -145,6 +200,7 @@ class Recording:
         """
         if self._stream is None:
             return
+        self._log_piece()
         if self._strip_length < len(self._positions):
             self.log_trajectory(np.array(self._positions))
         try:
@@ -169,6 +225,28 @@ class Recording:
         self._stream = None
         self._file.__exit__(None if error is None else type(error), error, None)
 
+    def _log_piece(self) -> None:
+        """Log the piece of the map that is complete."""
+        points = np.concatenate(self._piece) if self._piece else np.zeros((0, 3), np.float32)
+        self._piece = []
+        if not len(points):
+            return
+        low, high = np.percentile(points[:, 2], [2.0, 98.0])
+        entity = f"world/map/{self._pieces:02d}"
+        self._log_points(entity, points, colour_by_height(points[:, 2], float(low), float(high)), -1.0)
+        self._pieces += 1
+
+    def _log_points(self, entity: str, points: NDArray, colours: Any, radius: float = -1.5) -> None:
+        """Log points, scans' thinned to what the recording affords; a negative radius is in screen points."""
+        import rerun as rr
+
+        kept: Any = slice(None)
+        if not entity.startswith("world/map/"):
+            kept = _spread(len(points), self._scan_points)
+        colours = colours[kept] if isinstance(colours, np.ndarray) else [colours]
+        positions = np.ascontiguousarray(points[kept], np.float32)
+        self._open_stream().log(entity, rr.Points3D(positions, colors=colours, radii=[radius]))
+
     def _log_strip(
         self, entity: str, positions: NDArray[np.floating], colour: tuple[int, int, int], *, static: bool
     ) -> None:
@@ -191,20 +269,9 @@ class Recording:
 
 def _thinned(points: NDArray[np.floating], limit: int) -> NDArray[np.float32]:
     """Return at most ``limit`` of the points, spread evenly over their order."""
-    if len(points) > limit:
-        points = points[np.linspace(0, len(points) - 1, limit).astype(np.int64)]
-    return np.ascontiguousarray(points, np.float32)
+    return np.ascontiguousarray(points[_spread(len(points), limit)], np.float32)
 
 
-def _blueprint() -> "rrb.Blueprint":
-    import rerun.blueprint as rrb
-
-    return rrb.Blueprint(
-        rrb.Vertical(
-            rrb.Spatial3DView(origin="world", name="world"),
-            rrb.TimeSeriesView(origin="metrics", name="metrics"),
-            row_shares=[4, 1],
-        ),
-        rrb.TimePanel(timeline="scan"),
-        collapse_panels=True,
-    )
+def _spread(count: int, limit: int) -> Any:
+    """Return which of ``count`` things are kept: ``limit`` at most, spread evenly."""
+    return slice(None) if count <= limit else np.linspace(0, count - 1, limit).astype(np.int64)

@@ -48,5 +48,5 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return small_drive.write_folder(tmp_path_factory.mktemp("drive") / "drive", small_drive.moving())
 
 
-PLAIN = ("--set", "config.output.plot=false", "config.output.recording=false")
+PLAIN = ("--set", "config.output.plot=false", "config.output.recording=false", "config.output.report=false")
 """Leaves out the slow files where a test does not look at them."""

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from lio_jax.core.settings import load_settings
 from lio_jax.data.trajectory import Trajectory, write_tum
 from tests.data import bags
 from tests.run.small_drive import COUNT, bag_messages, moving, without_points, write_folder
@@ -103,3 +104,14 @@ def test_inspect_of_nothing(cli, tmp_path):
     done = cli("inspect", tmp_path / "nothing", "--json")
     assert (done.status, done.out) == (1, "")
     assert done.err == f"lio-jax: {tmp_path / 'nothing'}: no such file or folder; check the path.\n"
+
+
+def test_inspect_writes_settings_that_a_run_takes(cli, tmp_path):
+    bag = bags.write_bag(tmp_path / "a.bag", bag_messages(moving()[:3], False))
+    fits = tmp_path / "fits.yaml"
+    assert cli("inspect", bag, "--write-config", fits).status == 0
+    assert load_settings(fits).recipe == "default"
+    again = cli("inspect", bag, "--write-config", fits)
+    assert (again.status, again.out) == (2, "")
+    assert f"{fits}: exists" in again.err
+    assert cli("inspect", bag, "--write-config", fits, "--overwrite").status == 0

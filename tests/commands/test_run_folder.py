@@ -23,6 +23,9 @@ FILES = {
     "recording.rrd",
     "trajectory.png",
     "timings.png",
+    "scans.npz",
+    "truth.tum",
+    "report.html",
 }
 
 
@@ -161,10 +164,9 @@ def test_recording_holds_scans_map_trajectory_and_truth(run):
     rows: dict[str, int] = {}
     for chunk in RrdReader(run / "recording.rrd").stream():
         rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
-    assert {"/world/lidar", "/world/lidar/scan", "/world/map", "/world/trajectory", "/world/truth"} <= set(
-        rows
-    )
-    assert rows["/world/lidar"] == rows["/metrics/scan_ms"] == COUNT
+    expected = {"lidar", "lidar/scan", "lidar/raw", "imu", "map/00", "trajectory", "truth", "added"}
+    assert {f"/world/{entity}" for entity in expected} <= set(rows)
+    assert rows["/world/lidar"] == rows["/metrics/times/step"] == rows["/metrics/match/residual_m"] == COUNT
 
 
 def test_recorded_scans_lie_on_the_recorded_map(run):
@@ -178,9 +180,8 @@ def test_recorded_scans_lie_on_the_recorded_map(run):
     def points(row):
         return np.array(row["Points3D:positions"])
 
-    tree = cKDTree(
-        np.concatenate([points(row) for row in rows("/world/map") if row.get("Points3D:positions")])
-    )
+    pieces = [row for number in range(COUNT) for row in rows(f"/world/map/{number:02d}")]
+    tree = cKDTree(np.concatenate([points(row) for row in pieces]))
     poses = rows("/world/lidar")
     clouds = [row for row in rows("/world/lidar/scan") if row.get("Points3D:positions")]
     expected = np.loadtxt(run / "trajectory_kitti.txt").reshape(-1, 3, 4)

@@ -13,7 +13,15 @@ from lio_jax.data.trajectory import read_tum
 from lio_jax.run.run import run_sequence, settings_for
 from tests.run.small_drive import COUNT, Replay, moving, without_points
 
-FILES = ["config.yaml", "keyframes.g2o", "map.pcd", "metrics.json", "states.npz", "trajectory.tum"]
+FILES = [
+    "config.yaml",
+    "keyframes.g2o",
+    "map.pcd",
+    "metrics.json",
+    "scans.npz",
+    "states.npz",
+    "trajectory.tum",
+]
 
 
 def _stop_after(scans, error):

@@ -8,8 +8,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.viz.recording import Recording
+from lio_jax.viz import recording as recording_module
+from lio_jax.viz.recording import BYTES_PER_POINT, Recording
 
+TURN = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+SIGMA = TURN @ np.diag([0.01, 0.02, 0.05]) ** 2 @ TURN.T
 EPOCH_NS = 1_317_000_000_000_000_001
 PERIOD_NS = 100_000_000
 
@@ -24,13 +27,19 @@ def pose(index: int):
 def write(path, scans: int, points: int = 20_000):
     generator = np.random.default_rng(0)
     cloud = generator.normal(scale=20.0, size=(points, 3)).astype(np.float32)
+    corners = np.arange(points) < points // 4
     with Recording(path, scan_count=scans) as recording:
         recording.log_truth(np.array([pose(index)[:3, 3] for index in range(scans)]))
         for index in range(scans):
             stamp_ns = EPOCH_NS + index * PERIOD_NS
-            recording.log_scan(index, stamp_ns, cloud, pose(index))
-            recording.log_metrics(index, stamp_ns, {"scan_ms": 10.0 + index})
-        recording.log_map(cloud)
+            recording.log_scan(index, stamp_ns, cloud, pose(index), raw=cloud + 1.0, corners=corners)
+            recording.log_added(index, stamp_ns, cloud[:100] + 100.0 * index)
+            recording.log_pose(index, stamp_ns, "world/imu", pose(index))
+            recording.log_sigma(SIGMA)
+            recording.log_unobserved(np.eye(3)[: index % 2])
+            recording.log_metrics(
+                index, stamp_ns, {"times/step": 10.0 + index, "state/bias": [1.0, 2.0, 3.0]}
+            )
     return cloud
 
 
@@ -57,8 +66,22 @@ def test_entities_and_time_lines(written):
     lines: dict[str, set[str]] = {}
     for chunk in RrdReader(path).stream():
         lines.setdefault(chunk.entity_path, set()).update(chunk.timeline_names)
-    moving = {"/world/lidar", "/world/lidar/scan", "/world/trajectory", "/metrics/scan_ms"}
-    assert moving | {"/world", "/world/map", "/world/truth"} <= set(lines)
+    moving = {
+        "/world/lidar",
+        "/world/lidar/scan",
+        "/world/lidar/raw",
+        "/world/lidar/corners",
+        "/world/lidar/surfaces",
+        "/world/lidar/unobserved",
+        "/world/imu",
+        "/world/imu/position_100_sigma",
+        "/world/added",
+        "/world/map/00",
+        "/world/trajectory",
+        "/metrics/times/step",
+        "/metrics/state/bias",
+    }
+    assert moving | {"/world", "/world/truth"} <= set(lines)
     assert all(lines[entity] == {"scan", "time"} for entity in moving)
     assert lines["/world/truth"] == set()
     assert len(RrdReader(path).blueprints()) == 1
@@ -93,16 +116,81 @@ def test_trajectory_ends_complete(written):
     np.testing.assert_allclose(strip, [pose(index)[:3, 3] for index in range(40)], atol=1e-5)
 
 
-def test_map_and_truth_are_there(written):
+def test_the_map_grows_in_pieces_that_stay(written):
     path, cloud = written
-    assert any(len(row.get("Points3D:positions") or ()) == len(cloud) for row in rows(path, "/world/map"))
+    for index in range(40):
+        (row,) = rows(path, f"/world/map/{index:02d}")
+        np.testing.assert_allclose(row["Points3D:positions"], cloud[:100] + 100.0 * index, atol=1e-3)
+        # a piece is complete when the next scan comes
+        assert row["scan"] == min(index + 1, 39)
+
+
+def test_truth_is_there_at_all_times(written):
+    path, _ = written
     assert len(rows(path, "/world/truth")[0]["LineStrips3D:strips"][0]) == 40
+
+
+def test_features_are_apart(written):
+    path, cloud = written
+    counts = [
+        len(rows(path, f"/world/lidar/{kind}")[0]["Points3D:positions"]) for kind in ("corners", "surfaces")
+    ]
+    assert counts == [len(cloud) // 4, 5_000]
+    raw = np.array(rows(path, "/world/lidar/raw")[0]["Points3D:positions"])
+    np.testing.assert_allclose(raw[0], cloud[0] + 1.0, atol=1e-5)
+
+
+def test_the_ellipsoid_is_the_covariance_enlarged(written):
+    path, _ = written
+    row = rows(path, "/world/imu/position_100_sigma")[0]
+    axes = Rotation.from_quat(row["Ellipsoids3D:quaternions"][0]).as_matrix()
+    sizes = np.array(row["Ellipsoids3D:half_sizes"][0])
+    np.testing.assert_allclose(axes @ np.diag(sizes**2) @ axes.T, 100.0**2 * SIGMA, atol=1e-4)
+
+
+def test_open_directions_come_and_go(written):
+    path, _ = written
+    arrows = [row["Arrows3D:vectors"] for row in rows(path, "/world/lidar/unobserved")]
+    assert [len(vectors or ()) for vectors in arrows] == [index % 2 for index in range(40)]
 
 
 def test_metrics_come_back(written):
     path, _ = written
-    logged = rows(path, "/metrics/scan_ms")
+    logged = rows(path, "/metrics/times/step")
     assert [row["Scalars:scalars"][0] for row in logged] == [10.0 + index for index in range(40)]
+    assert rows(path, "/metrics/state/bias")[3]["Scalars:scalars"] == [1.0, 2.0, 3.0]
+
+
+def test_the_blueprint_shows_what_is_logged(written):
+    from lio_jax.viz.blueprint import ADDED, PLOTS, RAW
+
+    path, _ = written
+    entities = _entities(path)
+    assert {f"/{RAW}", f"/{ADDED}"} <= entities
+    assert all(
+        any(entity.startswith(f"/{PLOTS[name]}/") for entity in entities) for name in ("state", "times")
+    )
+
+
+def test_clouds_stay_within_their_budget(tmp_path, monkeypatch):
+    budget = 4_000_000
+    monkeypatch.setattr(recording_module, "CLOUD_BUDGET_BYTES", budget)
+    for scans in (20, 400):
+        path = tmp_path / f"{scans}.rrd"
+        write(path, scans)
+        clouds = rows(path, "/world/lidar/scan")
+        # the others: a map of 100 points a scan, poses and metrics
+        assert path.stat().st_size < budget + 8_000 * scans
+        assert 0.5 * budget < sum(len(row["Points3D:positions"]) for row in clouds) * BYTES_PER_POINT
+        assert len(rows(path, "/world/lidar")) == len(rows(path, "/metrics/times/step")) == scans
+    # of the long one not every scan
+    assert 50 < len(clouds) < 400
+
+
+def _entities(path) -> set[str]:
+    from rerun.chunk import RrdReader
+
+    return {chunk.entity_path for chunk in RrdReader(path).stream()}
 
 
 def test_long_recordings_get_fewer_points_a_scan(tmp_path):
@@ -112,7 +200,7 @@ def test_long_recordings_get_fewer_points_a_scan(tmp_path):
     first = next(
         row for row in rows(tmp_path / "long.rrd", "/world/lidar/scan") if "Points3D:positions" in row
     )
-    assert 1_000 <= len(first["Points3D:positions"]) < 2_000
+    assert len(first["Points3D:positions"]) == 1_000
 
 
 def test_strips_stay_linear_in_the_length_of_the_run(tmp_path):
@@ -128,7 +216,7 @@ def test_strips_stay_linear_in_the_length_of_the_run(tmp_path):
 def test_empty_scan_and_empty_map_are_recorded(tmp_path):
     with Recording(tmp_path / "empty.rrd") as recording:
         recording.log_scan(0, 0, np.zeros((0, 3), np.float32), np.eye(4))
-        recording.log_map(np.zeros((0, 3), np.float32))
+        recording.log_added(0, 0, np.zeros((0, 3), np.float32))
     assert len(rows(tmp_path / "empty.rrd", "/world/lidar")) == 1
 
 

@@ -1,0 +1,137 @@
+"""Read back what a run left in its folder, for reports."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from lio_jax.core.errors import LioJaxError
+from lio_jax.data.trajectory import Trajectory, read_tum
+from lio_jax.evaluation.alignment import Alignment, align
+from lio_jax.evaluation.association import MatchedTrajectories, match_by_time
+
+_NEEDED = ("states.npz", "metrics.json", "config.yaml")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A run's poses beside the true ones of the same instants."""
+
+    matched: MatchedTrajectories
+    alignment: Alignment
+
+    @property
+    def truth(self) -> Trajectory:
+        """The true poses, laid into the estimate's world as the absolute error is aligned."""
+        T_estimate_reference = np.linalg.inv(self.alignment.T_reference_estimate)
+        return Trajectory(
+            self.matched.reference.stamp_ns, T_estimate_reference @ self.matched.reference.poses
+        )
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """One run folder."""
+
+    folder: Path
+    metrics: dict[str, Any]
+    config_yaml: str
+    config: dict[str, Any]
+    states: dict[str, NDArray]
+    """Columns of states.npz."""
+    scans: dict[str, NDArray]
+    """Columns of scans.npz; none of a run that wrote none."""
+    comparison: Comparison | None = None
+    """None without truth."""
+    remarks: list[str] = field(default_factory=list)
+    """What could not be read or compared."""
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """T_world_imu at the scans' ends."""
+        return Trajectory(self.states["stamps_ns"], self.states["poses"])
+
+    @property
+    def seconds(self) -> NDArray[np.float64]:
+        """(n,) time since the first pose, s."""
+        return self.seconds_of(self.trajectory)
+
+    @property
+    def distance(self) -> NDArray[np.float64]:
+        """(n,) way since the first pose, m; a pose that is not finite adds nothing."""
+        steps = np.linalg.norm(np.diff(self.trajectory.positions, axis=0), axis=1)
+        return np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(steps), steps, 0.0))])
+
+    @property
+    def title(self) -> str:
+        """Recording and recipe."""
+        recording = self.metrics.get("recording", {}).get("name") or self.folder.name
+        return f"{recording}, {self.config.get('recipe', 'unknown recipe')}"
+
+    def seconds_of(self, trajectory: Trajectory) -> NDArray[np.float64]:
+        """Return when the poses of another trajectory are, s since this run's first pose."""
+        since: NDArray[np.float64] = (trajectory.stamp_ns - self.states["stamps_ns"][0]) * 1e-9
+        return since
+
+    def map_points(self) -> NDArray[np.float32] | None:
+        """Return the map's (n, 3) points, m in world; None where the run wrote none."""
+        path = self.folder / "map.pcd"
+        if not path.is_file():
+            return None
+        from pypcd4 import PointCloud
+
+        return PointCloud.from_path(path).numpy(("x", "y", "z"))
+
+
+def read_run(folder: Path) -> RunRecord:
+    """Read a run folder.
+
+    Raises:
+        LioJaxError: it is none, or a file of it is damaged.
+    """
+    missing = [name for name in _NEEDED if not (folder / name).is_file()]
+    if missing:
+        raise LioJaxError(f"{folder}: {missing[0]} is not there; give a folder that lio-jax run wrote.")
+    reading = folder / "metrics.json"
+    try:
+        metrics = json.loads(reading.read_text())
+        reading = folder / "config.yaml"
+        text = reading.read_text()
+        config = yaml.safe_load(text)
+        reading = folder / "states.npz"
+        states = _columns(reading)
+        if "poses" not in states or not len(states["poses"]):
+            raise ValueError("it holds no poses")
+        reading = folder / "scans.npz"
+        scans = _columns(reading) if reading.is_file() else {}
+    except (OSError, ValueError, yaml.YAMLError, EOFError) as error:
+        raise LioJaxError(f"{reading}: cannot be read ({error}); run again.") from None
+    remarks: list[str] = []
+    trajectory = Trajectory(states["stamps_ns"], states["poses"])
+    comparison = _compared(folder / "truth.tum", trajectory, remarks)
+    return RunRecord(folder, metrics, text, config, states, scans, comparison, remarks)
+
+
+def _columns(path: Path) -> dict[str, NDArray]:
+    import zipfile
+
+    try:
+        with np.load(path) as file:
+            return {name: file[name] for name in file.files}
+    except zipfile.BadZipFile as error:
+        raise ValueError(str(error)) from None
+
+
+def _compared(path: Path, estimate: Trajectory, remarks: list[str]) -> Comparison | None:
+    if not path.is_file():
+        return None
+    try:
+        matched = match_by_time(estimate, read_tum(path), "the estimate", "the truth")
+    except LioJaxError as reason:
+        remarks.append(f"The truth is not shown. {reason}")
+        return None
+    return Comparison(matched, align(matched.estimate.poses, matched.reference.poses))
