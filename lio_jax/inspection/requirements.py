@@ -18,13 +18,16 @@ def missing(scans: ScanSummary, imu: InertialSummary | None, calibrated: bool) -
         inertial.append("inertial samples: the motion is predicted by constant velocity")
     elif not calibrated:
         inertial.append("T_imu_lidar: taken as identity until params.extrinsics.* are given")
+    rings = [] if len(scans.rings) >= _FEW_RINGS else ["rings: features are found along them"]
     wants = {
         "default": [*inertial, *without_times],
         "fast_lio2": [*inertial, *without_times],
-        "loam": [
-            *([] if len(scans.rings) >= _FEW_RINGS else ["rings: features are found along them"]),
+        "lio_sam": [
+            *(["inertial samples: it does not run without"] if imu is None else inertial),
+            *rings,
             *without_times,
         ],
+        "loam": [*rings, *without_times],
     }
     nothing = [] if any(scans.counts) else ["scans with points"]
     return {recipe: nothing + wants.get(recipe, [*inertial, *without_times]) for recipe in RECIPES}
