@@ -73,7 +73,8 @@ def _gps_topic(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[
 
 def _sensor(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
     order = "arrival" if value == "livox" else "azimuth"
-    return {"config.features.order": order}, "fields are recognised from the messages; a ring's order is left"
+    word = "fields are recognised from the messages; a Livox's points keep their order, others go by azimuth"
+    return {"config.features.order": order}, word
 
 
 def _fixed(what: str, value: int) -> Rule:
