@@ -22,6 +22,15 @@ Assignments = Annotated[
     arg(name="set", metavar="PATH=VALUE ...", help="Replace settings, such as params.map.voxel_size=0.5."),
 ]
 Data = Positional[Annotated[Path, arg(metavar="DATA")]]
+Recipe = Annotated[str | None, arg(metavar="NAME|FILE.yaml")]
+ParamsFrom = Annotated[
+    Path | None,
+    arg(
+        metavar="FILE.yaml",
+        help="LIO-SAM's or FAST-LIO2's own parameter file: beats the recipe's values, yields to those of a "
+        "--recipe file and of --set.",
+    ),
+]
 Overwrite = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 app = tyro.extras.SubcommandApp()
@@ -102,8 +111,9 @@ def inspect(
 def run(
     data: Data,
     out: Annotated[Path, arg(metavar="DIR")],
-    recipe: Annotated[str, arg(metavar="NAME|FILE.yaml")] = "default",
+    recipe: Recipe = None,
     set_: Assignments = (),
+    params_from: ParamsFrom = None,
     start: Annotated[int, arg(metavar="N")] = 0,
     scans: Annotated[int | None, arg(metavar="N")] = None,
     gt: Annotated[Path | None, arg(metavar="FILE")] = None,
@@ -115,7 +125,8 @@ def run(
     Args:
         data: Recording: KITTI odometry sequence or raw drive, ROS 1 or ROS 2 bag, native folder.
         out: Folder for the results.
-        recipe: Recipe or settings file; a run's config.yaml repeats that run.
+        recipe: Recipe or settings file; a run's config.yaml repeats that run. None means default, or the
+            recipe of the system that --params-from is of.
         start: First scan.
         scans: How many scans; None means all.
         gt: Ground truth of T_world_imu (TUM, run folder or recording); None means the recording's own.
@@ -126,7 +137,7 @@ def run(
     from lio_jax.commands.runtime import prepare_jax
 
     prepare_jax()
-    command(data, recipe, set_, out, start, scans, gt, overwrite, live)
+    command(data, recipe, set_, params_from, out, start, scans, gt, overwrite, live)
 
 
 @app.command(name="eval")
@@ -212,8 +223,9 @@ def tune(
     params: Annotated[str, arg(metavar="GLOB,...")],
     out: Annotated[Path, arg(metavar="DIR")],
     objective: Annotated[str, arg(metavar="NAME")] = "noise",
-    recipe: Annotated[str, arg(metavar="NAME|FILE.yaml")] = "default",
+    recipe: Recipe = None,
     set_: Assignments = (),
+    params_from: ParamsFrom = None,
     validate: Annotated[tuple[Path, ...], arg(metavar="DATA ...")] = (),
     gt: Annotated[Path | None, arg(metavar="FILE")] = None,
     optimizer: Literal["auto", "scoring", "lbfgsb", "adam"] = "auto",
@@ -232,7 +244,7 @@ def tune(
         params: Parameters, such as imu.gyro_noise,imu.accel_noise or extrinsics.*.
         out: Folder for tuned.yaml, history.json and tuning.png; an earlier tuning there is gone on with.
         objective: noise, pose, point, planes, map, ate, rpe, rpe-rotation, or a sum such as ate+0.01*pose.
-        recipe: Recipe or settings file to start from.
+        recipe: Recipe or settings file to start from; None as for run.
         validate: Recordings that decide which iterate is taken and when to stop.
         gt: Ground truth of T_world_imu; None means the recordings' own.
         optimizer: auto takes scoring for likelihoods and lbfgsb for the others; adam steps on segments.
@@ -252,6 +264,7 @@ def tune(
     options = TuneOptions(
         recipe,
         set_,
+        params_from,
         params,
         objective,
         optimizer,

@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from lio_jax.commands.params_from import beneath_recipe, mapping_table
 from lio_jax.commands.runtime import say
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.core.files import atomic_path
 from lio_jax.core.settings import Settings, load_settings, recipe_settings, with_overrides
+from lio_jax.data.foreign_settings import load_foreign_settings
 from lio_jax.data.open import open_sequence
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory, write_tum
@@ -21,22 +23,41 @@ from lio_jax.viz.recording import Recording
 from lio_jax.viz.run_recording import RecordingObserver
 
 
-def resolve_settings(recipe: str, assignments: tuple[str, ...]) -> Settings:
+def resolve_settings(
+    recipe: str | None, assignments: tuple[str, ...], params_from: Path | None = None
+) -> Settings:
     """Return the settings of a recipe name or settings file, with ``--set`` applied.
+
+    Another system's parameters lie above the recipe's own values and beneath a settings file's; what became
+    of them is said.
+
+    Args:
+        recipe: name or file; None: default, or the recipe that stands for the other system.
+        assignments: of ``--set``.
+        params_from: parameter file of LIO-SAM or FAST-LIO2.
 
     Raises:
         UsageError: unknown recipe, unreadable file, unknown key or impossible value.
     """
-    is_file = recipe.endswith((".yaml", ".yml"))
-    settings = load_settings(Path(recipe)) if is_file else recipe_settings(recipe)
+    is_file = recipe is not None and recipe.endswith((".yaml", ".yml"))
+    if params_from is not None:
+        foreign = load_foreign_settings(params_from)
+        settings = beneath_recipe(foreign, recipe, is_file)
+    else:
+        name = recipe or Settings.recipe
+        settings = load_settings(Path(name)) if is_file else recipe_settings(name)
     recipe_named(settings.recipe)
-    return with_overrides(settings, assignments)
+    settings = with_overrides(settings, assignments)
+    if params_from is not None:
+        say(mapping_table(foreign, settings))
+    return settings
 
 
 def run(
     data: Path,
-    recipe: str,
+    recipe: str | None,
     assignments: tuple[str, ...],
+    params_from: Path | None,
     out: Path,
     start: int,
     scans: int | None,
@@ -47,7 +68,7 @@ def run(
     """Run one recording from the command line."""
     if start < 0 or (scans is not None and scans < 1):
         raise UsageError(f"--start must be 0 or more and --scans 1 or more, not {start} and {scans}.")
-    settings = resolve_settings(recipe, assignments)
+    settings = resolve_settings(recipe, assignments, params_from)
     sequence = open_sequence(data, settings.config.data)
     truth = truth_of(sequence, gt)
     if live and not settings.config.output.recording:

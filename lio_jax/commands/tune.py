@@ -37,8 +37,9 @@ TURN, SHIFT, LAG = math.radians(20), 0.5, 0.1
 class TuneOptions:
     """What ``lio-jax tune`` is told beside the recordings."""
 
-    recipe: str
+    recipe: str | None
     assignments: tuple[str, ...]
+    params_from: Path | None
     params: str
     objective: str
     optimiser: Optimiser
@@ -69,7 +70,7 @@ def tune(
         raise UsageError(
             f"--optimizer scoring wants a likelihood (pose, point, planes, noise), not {options.objective}."
         )
-    base = resolve_settings(options.recipe, options.assignments)
+    base = resolve_settings(options.recipe, options.assignments, options.params_from)
     patterns = [word.strip() for word in options.params.split(",") if word.strip()]
     free_parameters(base.params(), patterns)
     settings, training = _recordings(data, base, gt, named, options, options.segment)

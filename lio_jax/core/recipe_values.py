@@ -3,9 +3,18 @@
 from typing import Any
 
 _GYR_COV, _ACC_COV, _B_GYR_COV, _B_ACC_COV = 0.1, 0.1, 1e-4, 1e-4
-_IMU_RATE = 200.0
-"""FAST-LIO2 adds cov dt^2 to its covariance in each step of dt = 1 / rate; a density s adds s^2 dt. So
-s = sqrt(cov / rate), here at the rate of its example recordings, Hz. Its bias walks convert alike."""
+FAST_LIO2_IMU_RATE = 200.0
+"""Of its example recordings, Hz."""
+
+
+def fast_lio2_density(cov: float) -> float:
+    """Return the density that stands for one of FAST-LIO2's covariances, of white noise or of a bias walk.
+
+    It adds cov dt^2 to its covariance in each step of dt = 1 / rate; a density s adds s^2 dt. So
+    s = sqrt(cov / rate).
+    """
+    return (cov / FAST_LIO2_IMU_RATE) ** 0.5
+
 
 _DEGREE = 3.141592653589793 / 180
 
@@ -15,10 +24,10 @@ RECIPE_VALUES: dict[str, dict[str, Any]] = {
         "config.lidar.registration_points": 4096,
         "config.map.capacity": 65536,
         "config.registration.max_iterations": 4,
-        "params.imu.gyro_noise": (_GYR_COV / _IMU_RATE) ** 0.5,
-        "params.imu.accel_noise": (_ACC_COV / _IMU_RATE) ** 0.5,
-        "params.imu.gyro_bias_walk": (_B_GYR_COV / _IMU_RATE) ** 0.5,
-        "params.imu.accel_bias_walk": (_B_ACC_COV / _IMU_RATE) ** 0.5,
+        "params.imu.gyro_noise": fast_lio2_density(_GYR_COV),
+        "params.imu.accel_noise": fast_lio2_density(_ACC_COV),
+        "params.imu.gyro_bias_walk": fast_lio2_density(_B_GYR_COV),
+        "params.imu.accel_bias_walk": fast_lio2_density(_B_ACC_COV),
         # square roots of its first variances: 1, 1, 1e-4, 1e-3, 1e-5, 1e-5 and 1e-5
         "params.initial.rotation_sigma": 1.0,
         "params.initial.velocity_sigma": 1.0,

@@ -1,0 +1,156 @@
+"""LIO-SAM's parameters in this project's terms.
+
+Its ``extrinsicRot`` turns the IMU's vectors into the lidar's axes; ``extrinsicTrans`` is where the IMU lies
+in the lidar frame: what it calls lidar2Imu moves by +extrinsicTrans and stands behind the lidar's pose, once
+the samples are turned. Together they are T_lidar_imu, the inverse of ``params.extrinsics``; for KITTI its
+authors fill in calib_imu_to_velo.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from scipy.spatial.transform import Rotation
+
+from lio_jax.core.errors import UsageError
+from lio_jax.data.foreign_rules import (
+    Rule,
+    System,
+    nothing,
+    quaternion,
+    rotation,
+    same,
+    vector,
+)
+
+_SAME_AXES = 0.02
+"""Rotations are of the same axes if they differ by less, rad."""
+_FROM_NAVSAT = "odometry/gps"
+
+_OUTPUT = "names or draws what its nodes publish; a run writes a folder"
+_NO_LOOPS = "a run closes no loops"
+_NO_GPS = "a run does not use GPS"
+
+
+def _extrinsic_rot(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    settings = {"params.extrinsics.rotation": quaternion(rotation(value, place).inv())}
+    return settings, "inverted: it turns from the IMU's axes to the lidar's, ours is T_imu_lidar"
+
+
+def _extrinsic_trans(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    t_lidar_imu = vector(value, place)
+    R_lidar_imu = _rot_beside(place, values)
+    translation = [float(item) for item in -R_lidar_imu.inv().apply(t_lidar_imu) + 0.0]
+    word = "-extrinsicRot^T extrinsicTrans: it is where the IMU lies in the lidar frame, ours is T_imu_lidar"
+    return {"params.extrinsics.translation": translation}, word
+
+
+def _extrinsic_rpy(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    # its versions differ in whether they invert the matrix before they use it
+    of_orientations, of_samples = rotation(value, place), _rot_beside(place, values)
+    if any((of_orientations * other).magnitude() < _SAME_AXES for other in (of_samples, of_samples.inv())):
+        return {}, (
+            "fits extrinsicRot: the IMU's orientations are of its samples' axes, T_world_imu, as "
+            "config.imu.orientation takes them"
+        )
+    return {"config.imu.orientation": False}, (
+        "differs from extrinsicRot: the IMU's orientations are of other axes than its samples, and "
+        "config.imu.orientation takes them as T_world_imu"
+    )
+
+
+def _rot_beside(place: str, values: Mapping[str, Any]) -> Rotation:
+    if "extrinsicRot" not in values:
+        raise UsageError(f"{place} cannot be read without extrinsicRot, which is missing.")
+    source = place.rpartition(": ")[0]
+    return rotation(values["extrinsicRot"], f"{source}: extrinsicRot")
+
+
+def _gps_topic(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    if isinstance(value, str) and value.strip("/") == _FROM_NAVSAT:
+        return {}, "made by robot_localization while it runs; a NavSatFix of the recording is found by itself"
+    return {"config.data.gps_topic": value}, ""
+
+
+def _sensor(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    order = "arrival" if value == "livox" else "azimuth"
+    word = "fields are recognised from the messages; a Livox's points keep their order, others go by azimuth"
+    return {"config.features.order": order}, word
+
+
+def _fixed(what: str, value: int) -> Rule:
+    return nothing(f"the recipe lio_sam matches scans of at least {value} {what}")
+
+
+def _of_method(path: str, word: str = "") -> Rule:
+    return same(path, word=word, method=True)
+
+
+LIO_SAM = System(
+    name="LIO-SAM",
+    recipe="lio_sam",
+    rules={
+        "pointCloudTopic": same("config.data.lidar_topic"),
+        "imuTopic": same("config.data.imu_topic"),
+        "gpsTopic": Rule(_gps_topic),
+        **dict.fromkeys(
+            ("odomTopic", "lidarFrame", "baselinkFrame", "odometryFrame", "mapFrame"), nothing(_OUTPUT)
+        ),
+        "useImuHeadingInitialization": _of_method("config.imu.heading"),
+        **dict.fromkeys(("useGpsElevation", "gpsCovThreshold", "poseCovThreshold"), nothing(_NO_GPS)),
+        "savePCD": nothing("map.pcd is written unless config.output.map=false"),
+        "savePCDDirectory": nothing("map.pcd lies in the run's folder"),
+        "sensor": Rule(_sensor, method=True),
+        "N_SCAN": _of_method("config.features.rings"),
+        "Horizon_SCAN": _of_method("config.features.columns"),
+        "downsampleRate": _of_method("config.features.ring_step"),
+        "lidarMinRange": same("params.lidar.min_range"),
+        "lidarMaxRange": same("params.lidar.max_range"),
+        "imuAccNoise": same("params.imu.accel_noise"),
+        "imuGyrNoise": same("params.imu.gyro_noise"),
+        "imuAccBiasN": same("params.imu.accel_bias_walk"),
+        "imuGyrBiasN": same("params.imu.gyro_bias_walk"),
+        "imuGravity": same("params.imu.gravity"),
+        "imuRPYWeight": _of_method("params.smoother.tilt_weight"),
+        "extrinsicTrans": Rule(_extrinsic_trans),
+        "extrinsicRot": Rule(_extrinsic_rot),
+        "extrinsicRPY": Rule(_extrinsic_rpy),
+        "edgeThreshold": _of_method("params.features.corner_threshold"),
+        "surfThreshold": _of_method("params.features.flat_threshold"),
+        "edgeFeatureMinValidNum": _fixed("corners", 10),
+        "surfFeatureMinValidNum": _fixed("surface points", 100),
+        "odometrySurfLeafSize": _of_method("params.features.surface_spacing"),
+        "mappingCornerLeafSize": _of_method("params.map.corner_voxel_size"),
+        "mappingSurfLeafSize": _of_method("params.map.voxel_size"),
+        "z_tollerance": _of_method("params.smoother.height_limit"),
+        "rotation_tollerance": _of_method("params.smoother.tilt_limit"),
+        "numberOfCores": nothing("the machine's cores are used as JAX finds them"),
+        "mappingProcessInterval": _of_method(
+            "params.smoother.mapping_interval",
+            "spares time while driving; 0, the recipe's own, matches every scan",
+        ),
+        "surroundingkeyframeAddingDistThreshold": _of_method("params.submap.keyframe_distance"),
+        "surroundingkeyframeAddingAngleThreshold": _of_method("params.submap.keyframe_angle"),
+        "surroundingKeyframeDensity": _of_method("params.submap.spacing"),
+        "surroundingKeyframeSearchRadius": _of_method("params.submap.radius"),
+        **dict.fromkeys(
+            (
+                "loopClosureEnableFlag",
+                "loopClosureFrequency",
+                "surroundingKeyframeSize",
+                "historyKeyframeSearchRadius",
+                "historyKeyframeSearchTimeDiff",
+                "historyKeyframeSearchNum",
+                "historyKeyframeFitnessScore",
+            ),
+            nothing(_NO_LOOPS),
+        ),
+        **dict.fromkeys(
+            (
+                "globalMapVisualizationSearchRadius",
+                "globalMapVisualizationPoseDensity",
+                "globalMapVisualizationLeafSize",
+            ),
+            nothing(_OUTPUT),
+        ),
+    },
+)
