@@ -1,0 +1,213 @@
+"""Sparse Cholesky factorisation of matrices made of small square blocks, front by front (multifrontal).
+
+On the host: every front is a dense matrix for LAPACK. Duff & Reid, "The multifrontal solution of indefinite
+sparse symmetric linear equations", 1983.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import blas, lapack
+
+from lio_jax.loops.elimination_tree import EliminationTree, Front, elimination_tree
+
+_Runs = tuple[tuple[slice, slice], ...]
+
+
+@dataclass(frozen=True)
+class _Share:
+    """Where rows that a child is left with lie in its parent, run by run (child's, parent's)."""
+
+    in_panel: _Runs
+    in_rest: _Runs
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All that does not depend on the numbers of a matrix of d by d blocks.
+
+    A front's panel is its columns: its own nodes' rows first, then those of its ``rows``.
+    """
+
+    tree: EliminationTree
+    size: int
+    """d, the side of a block."""
+    places: NDArray[np.int64]
+    """(n + m, d, d) of the blocks' entries in the panels, which lie one behind the other."""
+    offsets: tuple[int, ...]
+    """Where each front's panel begins, and where the last one ends."""
+    shares: tuple[_Share | None, ...]
+
+
+def plan_of(count: int, pairs: NDArray[np.int64], size: int, tree: EliminationTree | None = None) -> Plan:
+    """Return the plan of a matrix with n diagonal blocks and m blocks at (pairs[k, 0], pairs[k, 1]).
+
+    Args:
+        count: n.
+        pairs: (m, 2) rows and columns of blocks, each below or above the diagonal and none twice.
+        size: side of a block.
+        tree: of the same pairs, where it is known already.
+    """
+    tree = tree or elimination_tree(count, pairs)
+    fronts = tree.fronts
+    widths = np.array([front.stop - front.start for front in fronts], np.int64)
+    heights = widths + np.array([len(front.rows) for front in fronts], np.int64)
+    offsets = np.concatenate([[0], np.cumsum(widths * heights * size**2)])
+    return Plan(
+        tree,
+        size,
+        _places(tree, pairs, size, widths, offsets),
+        tuple(offsets.tolist()),
+        tuple(_share(front, fronts, size) for front in fronts),
+    )
+
+
+def _places(
+    tree: EliminationTree,
+    pairs: NDArray[np.int64],
+    size: int,
+    widths: NDArray[np.int64],
+    offsets: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    count = len(tree.position)
+    row = np.concatenate([tree.position, tree.position[pairs[:, 0]]])
+    column = np.concatenate([tree.position, tree.position[pairs[:, 1]]])
+    turned = (row < column)[:, None, None]
+    row, column = np.maximum(row, column), np.minimum(row, column)
+    front_of = np.repeat(np.arange(len(widths)), widths)
+    starts = np.cumsum(widths) - widths
+    front = front_of[column]
+    within = row - starts[front]
+    lengths = np.array([len(front.rows) for front in tree.fronts], np.int64)
+    keys = np.repeat(np.arange(len(widths)), lengths) * count
+    keys = keys + np.concatenate([front.rows for front in tree.fronts] + [np.zeros(0, np.int64)])
+    found = np.searchsorted(keys, front * count + row) - (np.cumsum(lengths) - lengths)[front]
+    within = np.where(within < widths[front], within, widths[front] + found)
+    entry = np.arange(size)
+    across, down = np.where(turned, entry[:, None], entry), np.where(turned, entry, entry[:, None])
+    line = within[:, None, None] * size + down
+    return (
+        offsets[front][:, None, None]
+        + line * (widths[front] * size)[:, None, None]
+        + (column - starts[front])[:, None, None] * size
+        + across
+    )
+
+
+def _share(front: Front, fronts: tuple[Front, ...], size: int) -> _Share | None:
+    if front.parent < 0:
+        return None
+    parent = fronts[front.parent]
+    own = front.rows < parent.stop
+    panel = front.rows[own] - parent.start
+    rest = np.searchsorted(parent.rows, front.rows[~own])
+    return _Share(_runs(panel, 0, size), _runs(rest, len(panel), size))
+
+
+def _runs(places: NDArray[np.int64], offset: int, size: int) -> _Runs:
+    """Return consecutive places as slices of scalars: (in the child, in the parent)."""
+    cuts = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), len(places)]
+    return tuple(
+        (
+            slice((offset + a) * size, (offset + b) * size),
+            slice(int(places[a]) * size, (int(places[a]) + b - a) * size),
+        )
+        for a, b in zip(cuts[:-1], cuts[1:], strict=True)
+        if b > a
+    )
+
+
+class NotPositiveDefiniteError(ArithmeticError):
+    """The matrix has no Cholesky factor."""
+
+
+@dataclass(frozen=True)
+class Factor:
+    """The Cholesky factor of a matrix, as one panel per front."""
+
+    plan: Plan
+    panels: tuple[NDArray[np.float64], ...]
+
+
+def factorise(plan: Plan, blocks: NDArray[np.float64]) -> Factor:
+    """Return the factor of a symmetric matrix.
+
+    Args:
+        plan: of its pattern.
+        blocks: (n + m, d, d): the diagonal's, then one for each pair.
+
+    Raises:
+        NotPositiveDefiniteError: it is not positive definite.
+    """
+    size = plan.size
+    numbers = np.zeros(plan.offsets[-1])
+    numbers[plan.places.ravel()] = blocks.ravel()
+    panels = []
+    waiting: list[list[tuple[_Share, NDArray[np.float64]]]] = [[] for _ in plan.tree.fronts]
+    for index, front in enumerate(plan.tree.fronts):
+        width, rest = (front.stop - front.start) * size, len(front.rows) * size
+        panel = numbers[plan.offsets[index] : plan.offsets[index + 1]].reshape(width + rest, width)
+        left = np.zeros((rest, rest))
+        for share, update in waiting[index]:
+            _extend_add(share, update, panel, left, width)
+        waiting[index].clear()
+        # LAPACK counts columns first: what it takes for an upper triangle is our lower one
+        _, failed = lapack.dpotrf(panel[:width].T, lower=0, clean=0, overwrite_a=1)
+        if failed:
+            raise NotPositiveDefiniteError
+        if rest:
+            blas.dtrsm(1.0, panel[:width].T, panel[width:].T, lower=0, trans_a=1, overwrite_b=1)
+            blas.dsyrk(-1.0, panel[width:].T, 1.0, left.T, trans=1, lower=0, overwrite_c=1)
+            share = plan.shares[index]
+            assert share is not None
+            waiting[front.parent].append((share, left))
+        panels.append(panel)
+    return Factor(plan, tuple(panels))
+
+
+def _extend_add(
+    share: _Share,
+    update: NDArray[np.float64],
+    panel: NDArray[np.float64],
+    left: NDArray[np.float64],
+    width: int,
+) -> None:
+    """Add what a child is left with to its parent; of symmetric matrices the lower triangle."""
+    for number, (column, to_column) in enumerate(share.in_panel):
+        for row, to_row in share.in_panel[number:]:
+            panel[to_row, to_column] += update[row, column]
+        for row, to_row in share.in_rest:
+            panel[to_row.start + width : to_row.stop + width, to_column] += update[row, column]
+    for number, (column, to_column) in enumerate(share.in_rest):
+        for row, to_row in share.in_rest[number:]:
+            left[to_row, to_column] += update[row, column]
+
+
+def solve(factor: Factor, right: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the solution of A x = right for (n, d) or (n, d, k) right-hand sides."""
+    size = factor.plan.size
+    tree = factor.plan.tree
+    ordered = np.empty((len(tree.position), size, *right.shape[2:]))
+    ordered[tree.position] = right
+    columns = ordered.reshape(len(tree.position) * size, -1)
+    forward, backward = _triangular(columns.shape[1])
+    scattered = [(front.rows[:, None] * size + np.arange(size)).ravel() for front in tree.fronts]
+    for front, panel, rows in zip(tree.fronts, factor.panels, scattered, strict=True):
+        own, width = slice(front.start * size, front.stop * size), panel.shape[1]
+        columns[own] = forward(panel[:width], columns[own])
+        columns[rows] -= panel[width:] @ columns[own]
+    for front, panel, rows in zip(
+        reversed(tree.fronts), reversed(factor.panels), reversed(scattered), strict=True
+    ):
+        own, width = slice(front.start * size, front.stop * size), panel.shape[1]
+        columns[own] = backward(panel[:width], columns[own] - panel[width:].T @ columns[rows])
+    return ordered[tree.position]
+
+
+def _triangular(count):
+    def forward(lower, right):
+        return blas.dtrsm(1.0, lower.T, right, lower=0, trans_a=1)
+    def backward(lower, right):
+        return blas.dtrsm(1.0, lower.T, right, lower=0, trans_a=0)
+    return forward, backward
