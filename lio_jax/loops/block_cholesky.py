@@ -4,11 +4,15 @@ On the host: every front is a dense matrix for LAPACK. Duff & Reid, "The multifr
 sparse symmetric linear equations", 1983.
 """
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
+from threadpoolctl import ThreadpoolController
 
 from lio_jax.loops.elimination_tree import EliminationTree, Front, elimination_tree
 
@@ -38,6 +42,10 @@ class Plan:
     offsets: tuple[int, ...]
     """Where each front's panel begins, and where the last one ends."""
     shares: tuple[_Share | None, ...]
+    own: tuple[slice, ...]
+    """Where a front's own nodes lie in a vector in the order of elimination."""
+    rows: tuple[NDArray[np.int64], ...]
+    """Where the nodes lie that they are coupled to."""
 
 
 def plan_of(count: int, pairs: NDArray[np.int64], size: int, tree: EliminationTree | None = None) -> Plan:
@@ -60,6 +68,8 @@ def plan_of(count: int, pairs: NDArray[np.int64], size: int, tree: EliminationTr
         _places(tree, pairs, size, widths, offsets),
         tuple(offsets.tolist()),
         tuple(_share(front, fronts, size) for front in fronts),
+        tuple(slice(front.start * size, front.stop * size) for front in fronts),
+        tuple((front.rows[:, None] * size + np.arange(size)).ravel() for front in fronts),
     )
 
 
@@ -113,7 +123,7 @@ def _runs(places: NDArray[np.int64], offset: int, size: int) -> _Runs:
             slice((offset + a) * size, (offset + b) * size),
             slice(int(places[a]) * size, (int(places[a]) + b - a) * size),
         )
-        for a, b in zip(cuts[:-1], cuts[1:], strict=True)
+        for a, b in pairwise(cuts)
         if b > a
     )
 
@@ -128,6 +138,20 @@ class Factor:
 
     plan: Plan
     panels: tuple[NDArray[np.float64], ...]
+
+
+@cache
+def _libraries() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+def one_thread() -> AbstractContextManager:
+    """Return a context in which BLAS runs on one thread.
+
+    The fronts are small: its threads would wait for each other, and for hundreds of times as long where other
+    programs want the processor too.
+    """
+    return _libraries().limit(limits=1, user_api="blas")
 
 
 def factorise(plan: Plan, blocks: NDArray[np.float64]) -> Factor:
@@ -159,9 +183,9 @@ def factorise(plan: Plan, blocks: NDArray[np.float64]) -> Factor:
         if rest:
             blas.dtrsm(1.0, panel[:width].T, panel[width:].T, lower=0, trans_a=1, overwrite_b=1)
             blas.dsyrk(-1.0, panel[width:].T, 1.0, left.T, trans=1, lower=0, overwrite_c=1)
-            share = plan.shares[index]
-            assert share is not None
-            waiting[front.parent].append((share, left))
+            to_parent = plan.shares[index]
+            assert to_parent is not None
+            waiting[front.parent].append((to_parent, left))
         panels.append(panel)
     return Factor(plan, tuple(panels))
 
@@ -186,28 +210,20 @@ def _extend_add(
 
 def solve(factor: Factor, right: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the solution of A x = right for (n, d) or (n, d, k) right-hand sides."""
-    size = factor.plan.size
-    tree = factor.plan.tree
-    ordered = np.empty((len(tree.position), size, *right.shape[2:]))
-    ordered[tree.position] = right
-    columns = ordered.reshape(len(tree.position) * size, -1)
-    forward, backward = _triangular(columns.shape[1])
-    scattered = [(front.rows[:, None] * size + np.arange(size)).ravel() for front in tree.fronts]
-    for front, panel, rows in zip(tree.fronts, factor.panels, scattered, strict=True):
-        own, width = slice(front.start * size, front.stop * size), panel.shape[1]
-        columns[own] = forward(panel[:width], columns[own])
-        columns[rows] -= panel[width:] @ columns[own]
-    for front, panel, rows in zip(
-        reversed(tree.fronts), reversed(factor.panels), reversed(scattered), strict=True
-    ):
-        own, width = slice(front.start * size, front.stop * size), panel.shape[1]
-        columns[own] = backward(panel[:width], columns[own] - panel[width:].T @ columns[rows])
-    return ordered[tree.position]
-
-
-def _triangular(count):
-    def forward(lower, right):
-        return blas.dtrsm(1.0, lower.T, right, lower=0, trans_a=1)
-    def backward(lower, right):
-        return blas.dtrsm(1.0, lower.T, right, lower=0, trans_a=0)
-    return forward, backward
+    plan = factor.plan
+    position = plan.tree.position
+    ordered = np.empty((len(position), plan.size, *right.shape[2:]))
+    ordered[position] = right
+    x = ordered.reshape(len(position) * plan.size, -1)
+    parts = list(zip(factor.panels, plan.own, plan.rows, strict=True))
+    for panel, own, rows in parts:
+        width = panel.shape[1]
+        solved = blas.dtrsm(1.0, panel[:width].T, x[own], lower=0, trans_a=1)
+        x[own] = solved
+        if len(rows):
+            x[rows] -= panel[width:] @ solved
+    for panel, own, rows in reversed(parts):
+        width = panel.shape[1]
+        left = x[own] - panel[width:].T @ x[rows] if len(rows) else x[own]
+        x[own] = blas.dtrsm(1.0, panel[:width].T, left, lower=0)
+    return ordered[position]

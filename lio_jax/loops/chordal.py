@@ -5,13 +5,20 @@ and its use in pose graph optimization", ICRA 2015, section III-D. Both steps ar
 share the order of elimination with the solve itself.
 """
 
+import jax
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
 from lio_jax.loops.block_cholesky import factorise, solve
 from lio_jax.loops.graph import POSITION, PRIOR, PoseGraph, Poses
-from lio_jax.loops.host_poses import nearest_rotations, poses_from, rotation_matrices, translations
+from lio_jax.loops.host_poses import (
+    nearest_rotations,
+    numbers_of,
+    poses_from,
+    rotation_matrices,
+    translations,
+)
 from lio_jax.loops.structure import Structure, structure_of
 
 _Array = NDArray[np.float64]
@@ -31,7 +38,7 @@ def chordal_poses(graph: PoseGraph, structure: Structure, weights: _Array | None
     weights = np.ones(len(structure.i)) if weights is None else weights
     positions = np.flatnonzero(structure.kind == POSITION)
     if not len(positions):
-        return poses_from(*_relative_poses(graph, structure, weights))
+        return _with_held(graph, structure, *_relative_poses(graph, structure, weights))
     others = np.flatnonzero(structure.kind != POSITION)
     without = edges_at(graph, others)
     among_themselves = structure_of(without)
@@ -43,18 +50,29 @@ def chordal_poses(graph: PoseGraph, structure: Structure, weights: _Array | None
         own = structure.part == part
         turn, shift = _laid_onto(t[structure.j[here]], fixes[here], weights[here])
         R[own], t[own] = turn @ R[own], t[own] @ turn.T + shift
-    return poses_from(R, t)
+    return _with_held(graph, structure, R, t)
+
+
+def _with_held(graph: PoseGraph, structure: Structure, R: _Array, t: _Array) -> Poses:
+    """Return poses of which those of held vertices are the graph's own, to the last digit."""
+    found = poses_from(R, t)
+    numbers = np.where(structure.held[:, None], numbers_of(graph.poses), numbers_of(found))
+    return type(found)(jax.device_put(numbers))
 
 
 def edges_at(graph: PoseGraph, index: NDArray[np.int64]) -> PoseGraph:
     """Return the graph with only these edges."""
+
+    def chosen(leaf: ArrayLike) -> jax.Array:
+        return jax.device_put(np.asarray(leaf)[index])
+
     return PoseGraph(
         graph.poses,
-        np.asarray(graph.i)[index],
-        np.asarray(graph.j)[index],
-        type(graph.measurement)(np.asarray(graph.measurement.parameters())[index]),
-        np.asarray(graph.information)[index],
-        np.asarray(graph.kind)[index],
+        chosen(graph.i),
+        chosen(graph.j),
+        type(graph.measurement)(chosen(numbers_of(graph.measurement))),
+        chosen(graph.information),
+        chosen(graph.kind),
         graph.fixed,
     )
 
@@ -116,9 +134,7 @@ def _least_squares(
     pairs = _summed(structure.pair_of, H_pair, len(structure.pairs))
     x = start.copy()
     if count:
-        step = solve(
-            factorise(structure.plan_of_coordinates, np.concatenate([diagonal, pairs])), -gradient
-        )
+        step = solve(factorise(structure.plan_of_coordinates, np.concatenate([diagonal, pairs])), -gradient)
         x[~structure.held] = step
     return x
 
@@ -128,11 +144,12 @@ def _summed(place: NDArray[np.int64], values: _Array, count: int) -> _Array:
     gather = sparse.csr_matrix(
         (np.ones(len(place)), (place, np.arange(len(place)))), shape=(count + 1, len(place))
     )
-    return (gather @ values.reshape(len(place), -1))[:count].reshape(count, *values.shape[1:])
+    sums = np.asarray(gather @ values.reshape(len(place), -1))
+    return sums[:count].reshape(count, *values.shape[1:])
 
 
 def _laid_onto(points: _Array, targets: _Array, weights: _Array) -> tuple[_Array, _Array]:
-    """Return the turn and shift that lay points (m, k) onto targets best; no turn about where they leave it open."""
+    """Return the turn and shift that lay points (m, k) onto targets best; no turn where that is open."""
     share = weights / max(weights.sum(), np.finfo(float).tiny)
     centre, target_centre = share @ points, share @ targets
     spread = (targets - target_centre).T @ ((points - centre) * share[:, None])

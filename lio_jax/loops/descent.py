@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
@@ -29,7 +28,7 @@ class Limits:
     iterations: int = 100
     """Linear systems at most."""
     tolerance: float = 1e-8
-    """Converged when a step promises to lower the cost by less than this share of it; that step is still made."""
+    """Converged when a step promises to lower the cost by less than this share; that step is still made."""
 
 
 class Descent(NamedTuple):
@@ -46,8 +45,8 @@ def descend(
     """Return the poses of least cost near the given ones.
 
     Plain Gauss-Newton steps while they lower the cost; else the diagonal is raised by a share of itself, the
-    more the more steps fail in a row, and a tenth after each one that keeps its promise (Marquardt, "An algorithm
-    for least-squares estimation of nonlinear parameters", 1963).
+    more the more steps fail in a row, and by a tenth of it after each one that keeps its promise (Marquardt,
+    "An algorithm for least-squares estimation of nonlinear parameters", 1963).
 
     Args:
         padded: the graph.
@@ -57,7 +56,7 @@ def descend(
         limits: when to end.
     """
     step = np.zeros((len(padded.places.unknown) + 1, structure.tangent_size), padded.graph.information.dtype)
-    point = point_after(poses, jnp.asarray(step), weights, padded)
+    point = point_after(poses, jax.device_put(step), weights, padded)
     cost, damping, iterations = float(point.cost), 0.0, 0
     if not np.isfinite(cost):
         return Descent(point, 0, "not finite")
@@ -67,7 +66,7 @@ def descend(
         negligible = limits.tolerance * cost + _NEGLIGIBLE_PER_EDGE * len(structure.i)
         try:
             step[: structure.count], promised = equations.solved(damping)
-            tried = point_after(point.poses, jnp.asarray(step), weights, padded)
+            tried = point_after(point.poses, jax.device_put(step), weights, padded)
             gained = cost - float(tried.cost)
         except NotPositiveDefiniteError:
             promised = gained = -np.inf

@@ -44,10 +44,10 @@ class EliminationTree:
 def elimination_tree(count: int, pairs: NDArray[np.int64]) -> EliminationTree:
     """Return an order of little fill and its fronts.
 
-    Minimum degree ordering (Liu, "Modification of the minimum-degree algorithm by multiple elimination", 1985),
-    as in SuperLU; its factor of the graph's Laplacian has the pattern of ours. Nodes whose columns look alike
-    are joined into supernodes, and small ones into their parents (Ashcraft & Grimes, "The influence of relaxed
-    supernode partitions on the multifrontal method", 1989).
+    The order is SuperLU's minimum degree (Liu, "Modification of the minimum-degree algorithm by multiple
+    elimination", 1985), and its factor of the graph's Laplacian has the pattern of ours. Nodes whose columns
+    look alike are joined into supernodes, small ones into their parents too (Ashcraft & Grimes, "The
+    influence of relaxed supernode partitions on the multifrontal method", 1989).
 
     Args:
         count: of nodes.
@@ -65,7 +65,7 @@ def elimination_tree(count: int, pairs: NDArray[np.int64]) -> EliminationTree:
     )
     lower = minimum_degree.L.tocsc()
     lower.sort_indices()
-    column_start = lower.indptr
+    column_start = lower.indptr.astype(np.int64)
     below = np.diff(column_start) - 1
     parent = np.full(count, -1)
     parent[below > 0] = lower.indices[column_start[:-1][below > 0] + 1]
@@ -100,7 +100,7 @@ def elimination_tree(count: int, pairs: NDArray[np.int64]) -> EliminationTree:
 
 
 def _laplacian(count: int, pairs: NDArray[np.int64]) -> sparse.csc_matrix:
-    """Return the graph's Laplacian plus the identity: positive definite, and nothing in its factor cancels."""
+    """Return the graph's Laplacian plus the identity: its factor exists, and nothing in it cancels."""
     ones = np.ones(len(pairs))
     coupled = sparse.coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), (count, count)).tocsr()
     coupled = coupled + coupled.T
@@ -111,9 +111,7 @@ def _laplacian(count: int, pairs: NDArray[np.int64]) -> sparse.csc_matrix:
 def _supernodes(parent: NDArray[np.int64], below: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the first column of each run of columns with one pattern below them."""
     children = np.bincount(parent[parent >= 0], minlength=len(parent))
-    goes_on = (
-        (parent[:-1] == np.arange(1, len(parent))) & (below[:-1] == below[1:] + 1) & (children[1:] == 1)
-    )
+    goes_on = (parent[:-1] == np.arange(1, len(parent))) & (below[:-1] == below[1:] + 1) & (children[1:] == 1)
     return np.flatnonzero(np.append(True, ~goes_on))
 
 
@@ -142,7 +140,7 @@ def _postorder(kept_in: NDArray[np.int64], parent: NDArray[np.int64]) -> tuple[l
     children: list[list[int]] = [[] for _ in kept_in]
     for supernode, top in enumerate(kept_in.tolist()):
         members[top].append(supernode)
-    roots = []
+    roots: list[int] = []
     kept = np.unique(kept_in).tolist()
     for top in kept:
         above = parent[top]

@@ -1,16 +1,15 @@
 """Residuals of a pose graph's edges, their cost and its linearisation.
 
-The cost is half the sum of r' Omega r, with r = Log(Z^-1 T_i^-1 T_j) by the group's logarithm, rotation vector
-and all: the error of gtsam's BetweenFactor and PriorFactor. g2o's own program takes twice as much, of a residual
-whose rotation is half a quaternion.
+The cost is half the sum of r' Omega r, with r = Log(Z^-1 T_i^-1 T_j) by the group's logarithm: the error of
+gtsam's BetweenFactor and PriorFactor, in space and in the plane. g2o's own program counts twice that, of
+residuals that are no logarithms.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import jaxlie
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from lio_jax.core.rotation import skew
 from lio_jax.loops.graph import POSITION, PRIOR, PoseGraph, Poses, picked, rotation_first
@@ -82,8 +81,8 @@ def right_jacobian_inverse(tangent: Float[Array, "e d"]) -> Float[Array, "e d d"
     """Return the derivative of Log(exp(tangent) exp(d)) at d = 0.
 
     J_r^-1 = I + ad / 2 + a ad^2 + b ad^4 with a = 2 / x^2 + (x + 3 sin x) / (4 x (cos x - 1)) and
-    b = 1 / x^4 + (x + sin x) / (4 x^3 (cos x - 1)), x the angle (Bullo & Murray, "Proportional derivative (PD)
-    control on the Euclidean group", 1995); in the plane ad^4 = -x^2 ad^2 and the same holds.
+    b = 1 / x^4 + (x + sin x) / (4 x^3 (cos x - 1)), x the angle (Bullo & Murray, "Proportional derivative
+    (PD) control on the Euclidean group", 1995); in the plane ad^4 = -x^2 ad^2 and the same holds.
     """
     rotation = tangent[:, :3] if tangent.shape[-1] == 6 else tangent[:, :1]
     squared = jnp.sum(rotation**2, -1)
@@ -140,8 +139,9 @@ def _ad(tangent: Float[Array, "e d"]) -> Float[Array, "e d d"]:
 
 
 def _product(left: Float[Array, "e d d"], right: Float[Array, "e d d"]) -> Float[Array, "e d d"]:
-    """Return the products of small matrices: one vectorised loop, where XLA's own is a call for each matrix."""
-    return sum(left[..., :, k, None] * right[..., None, k, :] for k in range(left.shape[-1]))
+    """Return the products of small matrices in one vectorised loop; XLA's own is a call for each of them."""
+    terms = [left[..., :, k, None] * right[..., None, k, :] for k in range(left.shape[-1])]
+    return sum(terms[1:], terms[0])
 
 
 def _turned(matrix: Float[Array, "e d d"]) -> Float[Array, "e d d"]:

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax.numpy as jnp
+import jax
 import jaxlie
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.loops.graph import LOOP, ODOMETRY, PoseGraph, Poses
@@ -49,8 +49,8 @@ class G2oFile:
 def read_g2o(path: Path) -> G2oFile:
     """Return the pose graph that a file holds.
 
-    Edges between vertices whose numbers follow on each other in the file's order count as odometry, all others
-    as loops. Information is taken as of (x, y, z, rotation vector), as gtsam does.
+    Edges between vertices whose numbers follow on each other count as odometry, all others as loops. The
+    information is taken as that of (x, y, z, rotation vector), as gtsam does.
 
     Raises:
         LioJaxError: the file cannot be read as a pose graph; the message names the line.
@@ -68,16 +68,15 @@ def read_g2o(path: Path) -> G2oFile:
     tags = (layout.vertex, layout.edge, _FIX)
     unknown = Counter({tag: len(at) for tag, at in numbers.items() if tag not in tags})
     notes = [
-        f"{count} line{'s' * (count > 1)} of the unknown kind {tag} skipped (first: line {numbers[tag][0] + 1})."
+        f"{_counted(count, 'line')} of the unknown kind {tag} skipped (first: line {numbers[tag][0] + 1})."
         for tag, count in unknown.items()
     ]
     at_vertices, at_edges, at_fixes = (np.array(numbers.get(tag, []), np.int64) for tag in tags)
-    vertices = _table(path, lines, at_vertices, 1 + layout.pose_numbers)
+    columns, vertices = _table(path, lines, at_vertices, 1, layout.pose_numbers)
     triangle = layout.size * (layout.size + 1) // 2
-    edges = _table(path, lines, at_edges, 2 + layout.pose_numbers + triangle)
+    ends, edges = _table(path, lines, at_edges, 2, layout.pose_numbers + triangle)
 
-    ids = _whole(path, vertices[:, 0], at_vertices)
-    ends = _whole(path, edges[:, :2].ravel(), np.repeat(at_edges, 2)).reshape(-1, 2)
+    ids = columns[:, 0]
     if not len(ids):
         ids = np.unique(ends)
         notes.append("the file holds no vertices; the first guess is made from the edges.")
@@ -87,22 +86,21 @@ def read_g2o(path: Path) -> G2oFile:
     _refuse(path, at_edges, ends[:, 0] == ends[:, 1], "the edge joins a vertex to itself")
     notes += _duplicates(ends, at_edges)
     fixed = np.zeros(len(ids), bool)
-    fixed_ids = _fixed(path, lines, at_fixes)
-    fixed[_index(path, ids, order, fixed_ids[:, None], np.repeat(at_fixes, 1)[: len(fixed_ids)]).ravel()] = True
+    fixed_ids, at_fixed = _fixed(path, lines, at_fixes)
+    fixed[_index(path, ids, order, fixed_ids[:, None], at_fixed).ravel()] = True
 
-    pose_columns = slice(2, 2 + layout.pose_numbers)
     rank = np.argsort(order)
     steps = rank[ends[:, 1]] - rank[ends[:, 0]]
     has_poses = bool(len(at_vertices))
-    poses = vertices[:, 1:] if has_poses else _identities(len(ids), layout)
+    poses = vertices if has_poses else _identities(len(ids), layout)
     graph = PoseGraph(
         poses=_poses(path, poses, at_vertices),
-        i=jnp.asarray(ends[:, 0]),
-        j=jnp.asarray(ends[:, 1]),
-        measurement=_poses(path, edges[:, pose_columns], at_edges),
-        information=jnp.asarray(_information(path, edges[:, pose_columns.stop :], layout, at_edges)),
-        kind=jnp.asarray(np.where(np.abs(steps) == 1, ODOMETRY, LOOP)),
-        fixed=jnp.asarray(fixed),
+        i=jax.device_put(ends[:, 0]),
+        j=jax.device_put(ends[:, 1]),
+        measurement=_poses(path, edges[:, : layout.pose_numbers], at_edges),
+        information=jax.device_put(_information(path, edges[:, layout.pose_numbers :], layout, at_edges)),
+        kind=jax.device_put(np.where(np.abs(steps) == 1, ODOMETRY, LOOP)),
+        fixed=jax.device_put(fixed),
     )
     notes += _parts(ids, ends)
     return G2oFile(graph, ids, has_poses, tuple(notes))
@@ -120,43 +118,47 @@ def _layout(path: Path, numbers: dict[str, list[int]]) -> _Layout:
     return there[0]
 
 
-def _table(path: Path, lines: Sequence[str], at: NDArray[np.int64], columns: int) -> _Array:
-    """Return the numbers behind the tags of some lines, all parsed at once."""
+def _table(
+    path: Path, lines: Sequence[str], at: NDArray[np.int64], whole: int, real: int
+) -> tuple[NDArray[np.int64], _Array]:
+    """Return vertices' numbers and the other numbers behind the tags of some lines, all parsed at once."""
     words = " ".join([lines[number] for number in at.tolist()]).split()
-    if len(words) == len(at) * (columns + 1):
-        table = np.array(words, object).reshape(len(at), columns + 1)[:, 1:]
+    columns = 1 + whole + real
+    if len(words) == len(at) * columns:
+        table = np.array(words, object).reshape(len(at), columns)
         try:
-            numbers = table.astype(np.float64)
-        except ValueError:
+            vertices, numbers = (
+                table[:, 1 : 1 + whole].astype(np.int64),
+                table[:, 1 + whole :].astype(np.float64),
+            )
+        except (ValueError, OverflowError):
             pass
         else:
             _refuse(path, at, ~np.isfinite(numbers).all(1), "a number is not finite")
-            return numbers
-    raise _unreadable_line(path, lines, at, columns)
+            return vertices, numbers
+    raise _unreadable_line(path, lines, at, whole, real)
 
 
-def _unreadable_line(path: Path, lines: Sequence[str], at: NDArray[np.int64], columns: int) -> LioJaxError:
+def _unreadable_line(
+    path: Path, lines: Sequence[str], at: NDArray[np.int64], whole: int, real: int
+) -> LioJaxError:
     for number in at.tolist():
         tag, *words = lines[number].split()
-        if len(words) != columns:
-            return LioJaxError(f"{path}: line {number + 1}: {tag} needs {columns} numbers, not {len(words)}.")
-        for word in words:
+        where = f"{path}: line {number + 1}"
+        if len(words) != whole + real:
+            return LioJaxError(f"{where}: {tag} needs {whole + real} numbers, not {len(words)}.")
+        for place, word in enumerate(words):
             try:
-                float(word)
-            except ValueError:
-                return LioJaxError(f"{path}: line {number + 1}: '{word}' is not a number.")
+                np.int64(int(word)) if place < whole else float(word)
+            except (ValueError, OverflowError):
+                noun = "vertex's number" if place < whole else "number"
+                return LioJaxError(f"{where}: '{word}' is not a {noun}.")
     raise AssertionError("all lines can be read")
 
 
-def _refuse(path: Path, at: NDArray[np.int64], wrong: NDArray[np.bool_], reason: str) -> None:
+def _refuse(path: Path, at: NDArray[np.int64], wrong: ArrayLike, reason: str) -> None:
     if np.any(wrong):
         raise LioJaxError(f"{path}: line {at[np.argmax(wrong)] + 1}: {reason}.")
-
-
-def _whole(path: Path, numbers: _Array, at: NDArray[np.int64]) -> NDArray[np.int64]:
-    whole = numbers.astype(np.int64)
-    _refuse(path, at, whole != numbers, "a vertex's number must be whole")
-    return whole
 
 
 def _refuse_twice(path: Path, ids: NDArray[np.int64], at: NDArray[np.int64]) -> None:
@@ -183,16 +185,15 @@ def _index(
     return found
 
 
-def _fixed(path: Path, lines: Sequence[str], at: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the numbers of the vertices that FIX lines hold, of which each may name several."""
-    found: list[int] = []
-    for number in at.tolist():
-        for word in lines[number].split()[1:]:
-            try:
-                found.append(int(word))
-            except ValueError:
-                raise LioJaxError(f"{path}: line {number + 1}: '{word}' is not a vertex's number.") from None
-    return np.array(found, np.int64)
+def _fixed(
+    path: Path, lines: Sequence[str], at: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the numbers of the vertices that FIX lines hold, of which each may name several, and where."""
+    words = [(word, number) for number in at.tolist() for word in lines[number].split()[1:]]
+    for word, number in words:
+        if not word.isdecimal():
+            raise LioJaxError(f"{path}: line {number + 1}: '{word}' is not a vertex's number.")
+    return np.array([int(word) for word, _ in words], np.int64), np.array([at for _, at in words], np.int64)
 
 
 def _identities(count: int, layout: _Layout) -> _Array:
@@ -206,11 +207,11 @@ def _poses(path: Path, numbers: _Array, at: NDArray[np.int64]) -> Poses:
     """Return poses of rows (x, y, z, qx, qy, qz, qw) or (x, y, angle)."""
     if numbers.shape[1] == PLANE.pose_numbers:
         turn = np.stack([np.cos(numbers[:, 2]), np.sin(numbers[:, 2])], -1)
-        return jaxlie.SE2(jnp.asarray(np.concatenate([turn, numbers[:, :2]], -1)))
+        return jaxlie.SE2(jax.device_put(np.concatenate([turn, numbers[:, :2]], -1)))
     length = np.linalg.norm(numbers[:, 3:], axis=1)
     _refuse(path, at, np.abs(length - 1) > 0.1, "the quaternion's length is not 1")
     wxyz = numbers[:, [6, 3, 4, 5]] / length[:, None]
-    return jaxlie.SE3(jnp.asarray(np.concatenate([wxyz, numbers[:, :3]], -1)))
+    return jaxlie.SE3(jax.device_put(np.concatenate([wxyz, numbers[:, :3]], -1)))
 
 
 def _information(path: Path, triangle: _Array, layout: _Layout, at: NDArray[np.int64]) -> _Array:
@@ -233,9 +234,10 @@ def _duplicates(ends: NDArray[np.int64], at: NDArray[np.int64]) -> list[str]:
     again = np.setdiff1d(np.arange(len(pairs)), first)
     if not len(again):
         return []
+    edges = _counted(len(again), "edge")
+    first_line = at[again[0]] + 1
     return [
-        f"{len(again)} edge{'s' * (len(again) > 1)} between vertices that another edge joins already "
-        f"(first: line {at[again[0]] + 1}); all of them count."
+        f"{edges} between vertices that another edge joins already (first: line {first_line}); all count."
     ]
 
 
@@ -246,7 +248,9 @@ def _parts(ids: NDArray[np.int64], ends: NDArray[np.int64]) -> list[str]:
         return []
     named = ", ".join(f"{ids[at]} ({size})" for at, size in zip(first[:5], sizes[:5], strict=True))
     more = ", ..." if len(first) > 5 else ""
-    return [
-        f"the graph falls into {len(first)} parts that nothing joins; each is solved by itself, "
-        f"from its first vertex (and its size): {named}{more}."
-    ]
+    said = f"the graph falls into {len(first)} parts that nothing joins; each is solved by itself"
+    return [f"{said}. Their first vertices (and sizes): {named}{more}."]
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' * (count > 1)}"

@@ -18,7 +18,7 @@ _Array = NDArray[np.float64]
 _GROWTH = 1.4
 """Of the control parameter, from one set of weights to the next."""
 _ROUNDS = 200
-_ON_THE_WAY = Limits(iterations=3, tolerance=1e-3)
+_ON_THE_WAY = Limits(iterations=10, tolerance=1e-4)
 _SHRUNK = 0.9
 """When only this share of the edges still has a weight the order of elimination is found anew."""
 _SETTLED = 1e-3
@@ -30,7 +30,7 @@ class Robust:
     """Which edges may be wrong, and from when on they are."""
 
     confidence: float = 0.99
-    """Share of right edges whose squared whitened residual is below the limit, by the chi-square distribution."""
+    """Share of right edges whose r' Omega r is below the limit, by the chi-square distribution."""
     trusted_kinds: tuple[int, ...] = (ODOMETRY, PRIOR)
     """Edges that are taken to be right."""
 
@@ -46,11 +46,11 @@ class Graduated(NamedTuple):
 def graduate(
     graph: PoseGraph, structure: Structure, padded: Padded, poses: Poses, robust: Robust, limits: Limits
 ) -> Graduated:
-    """Return poses and weights of the truncated least squares, from a convex problem to the one that is meant.
+    """Return poses and weights of the truncated least squares, beginning with a convex problem.
 
-    GNC-TLS of Yang, Antonante, Tzoumas & Carlone, "Graduated non-convexity for robust spatial perception: from
-    non-minimal solvers to global outlier rejection", RA-L 2020, equations (13) and (14). The first residuals are
-    those at the poses that the trusted edges ask for, where these connect all vertices, else at ``poses``.
+    GNC-TLS of Yang, Antonante, Tzoumas & Carlone, "Graduated non-convexity for robust spatial perception:
+    from non-minimal solvers to global outlier rejection", RA-L 2020. The first residuals are those at the
+    poses that the trusted edges ask for, where these connect all vertices, else at ``poses``.
 
     Args:
         graph: as it is.
@@ -61,7 +61,9 @@ def graduate(
         limits: of the last descent, with the weights found.
     """
     doubted = ~np.isin(structure.kind, robust.trusted_kinds)
-    size = np.where(structure.kind == POSITION, 3 if structure.tangent_size == 6 else 2, structure.tangent_size)
+    size = np.where(
+        structure.kind == POSITION, 3 if structure.tangent_size == 6 else 2, structure.tangent_size
+    )
     limit = chi2.ppf(robust.confidence, size)
     weights = np.where(doubted, 0.0, 1.0)
     start = _poses_of_trusted(graph, structure, ~doubted)
@@ -115,4 +117,3 @@ def _poses_of_trusted(graph: PoseGraph, structure: Structure, trusted: NDArray[n
         return None
     alone = edges_at(graph, np.flatnonzero(trusted))
     return chordal_poses(alone, structure_of(alone))
-

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-Poses = jaxlie.SE3 | jaxlie.SE2
-"""Poses of one kind, T_world_body, with one batch axis."""
+Poses = jaxlie.SEBase
+"""SE3 or SE2, all of one kind, with one batch axis."""
 
 ODOMETRY, LOOP, PRIOR, POSITION = range(4)
 """Kinds of edge. A prior states a vertex's pose, a position its translation, such as a GPS fix."""

@@ -1,6 +1,6 @@
 """Poses as numpy matrices, for the host's part of a pose graph."""
 
-import jax.numpy as jnp
+import jax
 import jaxlie
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,18 @@ from lio_jax.loops.graph import Poses
 _Array = NDArray[np.float64]
 
 
+def numbers_of(poses: Poses) -> _Array:
+    """Return what the poses are made of: (w, x, y, z) or (cosine, sine), then the translation.
+
+    jaxlie's own ``parameters()`` is compiled for every number of poses.
+    """
+    (numbers,) = jax.tree.leaves(poses)
+    return np.asarray(numbers)
+
+
 def rotation_matrices(poses: Poses) -> _Array:
     """Return (n, 3, 3), in the plane (n, 2, 2)."""
-    numbers = np.asarray(poses.parameters(), np.float64)
+    numbers = numbers_of(poses)
     if isinstance(poses, jaxlie.SE3):
         return Rotation.from_quat(numbers[:, :4], scalar_first=True).as_matrix().reshape(-1, 3, 3)
     cosine, sine = (numbers[:, :2] / np.linalg.norm(numbers[:, :2], axis=1, keepdims=True)).T
@@ -22,15 +31,15 @@ def rotation_matrices(poses: Poses) -> _Array:
 
 def translations(poses: Poses) -> _Array:
     """Return (n, 3), in the plane (n, 2)."""
-    return np.asarray(poses.parameters(), np.float64)[:, 4 if isinstance(poses, jaxlie.SE3) else 2 :]
+    return numbers_of(poses)[:, 4 if isinstance(poses, jaxlie.SE3) else 2 :]
 
 
 def poses_from(rotation: _Array, translation: _Array) -> Poses:
     """Return the poses of rotation matrices, (n, 3, 3) or (n, 2, 2), and translations."""
     if translation.shape[-1] == 2:
-        return jaxlie.SE2(jnp.asarray(np.concatenate([rotation[:, :, 0], translation], -1)))
+        return jaxlie.SE2(jax.device_put(np.concatenate([rotation[:, :, 0], translation], -1)))
     wxyz = Rotation.from_matrix(rotation).as_quat(scalar_first=True).reshape(-1, 4)
-    return jaxlie.SE3(jnp.asarray(np.concatenate([wxyz, translation], -1)))
+    return jaxlie.SE3(jax.device_put(np.concatenate([wxyz, translation], -1)))
 
 
 def nearest_rotations(matrix: _Array) -> _Array:

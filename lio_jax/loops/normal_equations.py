@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lio_jax.loops.factors import linearise
 from lio_jax.loops.graph import PoseGraph, Poses, moved
+from lio_jax.loops.host_poses import numbers_of
 from lio_jax.loops.structure import Structure
 
 
@@ -55,8 +56,8 @@ def padded(graph: PoseGraph, structure: Structure) -> Padded:
     more_edges, more_vertices = size_at_least(edges) - edges, size_at_least(vertices) - vertices
 
     def longer(leaf: Array, by: int, value: float = 0) -> Array:
-        leaf = np.asarray(leaf)
-        return jnp.asarray(np.pad(leaf, [(0, by), *[(0, 0)] * (leaf.ndim - 1)], constant_values=value))
+        values = np.asarray(leaf)
+        return jax.device_put(np.pad(values, [(0, by), *[(0, 0)] * (values.ndim - 1)], constant_values=value))
 
     return Padded(
         PoseGraph(
@@ -78,27 +79,30 @@ def places_in(structure: Structure) -> Places:
     def longer(values: NDArray, none: int) -> Array:
         """Return padded values, with those that equal ``none`` at the last place."""
         wanted = np.where(values == none, -1, values)
-        return jnp.asarray(np.pad(wanted, (0, size_at_least(len(values)) - len(values)), constant_values=-1))
+        return jax.device_put(np.pad(wanted, (0, more(len(values))), constant_values=-1))
+
+    def more(count: int) -> int:
+        return size_at_least(count) - count
 
     turned = structure.unknown[structure.i] < structure.unknown[structure.j]
     return Places(
         unknown=longer(structure.unknown, structure.count),
         pair=longer(structure.pair_of, len(structure.pairs)),
-        turned=jnp.asarray(np.pad(turned, (0, size_at_least(len(turned)) - len(turned)))),
+        turned=jax.device_put(np.pad(turned, (0, more(len(turned))))),
     )
 
 
 def padded_poses(poses: Poses, count: int) -> Poses:
     """Return ``count`` poses, the identity behind those given."""
-    own = np.asarray(poses.parameters())
+    own = numbers_of(poses)
     none = np.zeros((count - len(own), own.shape[-1]), own.dtype)
     none[:, 0] = 1
-    return type(poses)(jnp.asarray(np.concatenate([own, none])))
+    return type(poses)(jax.device_put(np.concatenate([own, none])))
 
 
 def padded_weights(weights: NDArray[np.float64], padded: Padded) -> Float[Array, " e"]:
     """Return weights of the edges, 0 of those that padding added."""
-    return jnp.asarray(np.pad(weights, (0, len(padded.graph.i) - len(weights))))
+    return jax.device_put(np.pad(weights, (0, len(padded.graph.i) - len(weights))))
 
 
 @jax.jit
@@ -114,13 +118,17 @@ def point_after(
         padded: the graph.
     """
     graph, places = padded
-    poses = moved(poses, step[places.unknown])
+    held = (places.unknown < 0)[:, None]
+    stepped = moved(poses, step[places.unknown])
+    poses = jax.tree.map(lambda still, gone: jnp.where(held, still, gone), poses, stepped)
     parts = linearise(poses, graph)
     w = weights[:, None, None]
     H_pair = w * jnp.where(places.turned[:, None, None], jnp.swapaxes(parts.H_ij, -1, -2), parts.H_ij)
     i, j = places.unknown[graph.i], places.unknown[graph.j]
     size = step.shape[-1]
-    diagonal = jnp.zeros((len(step), size, size), step.dtype).at[i].add(w * parts.H_ii).at[j].add(w * parts.H_jj)
+    diagonal = (
+        jnp.zeros((len(step), size, size), step.dtype).at[i].add(w * parts.H_ii).at[j].add(w * parts.H_jj)
+    )
     pairs = jnp.zeros((len(weights) + 1, size, size), step.dtype).at[places.pair].add(H_pair)
     w = weights[:, None]
     return Point(

@@ -12,13 +12,11 @@ from collections.abc import Sequence
 from typing import Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.loops.block_cholesky import NotPositiveDefiniteError, factorise
+from lio_jax.loops.block_cholesky import NotPositiveDefiniteError, factorise, one_thread
 from lio_jax.loops.block_cholesky import solve as solve_factored
 from lio_jax.loops.chordal import chordal_poses
 from lio_jax.loops.descent import Equations, Limits, descend
@@ -34,7 +32,7 @@ def solve(
     graph: PoseGraph,
     start: Literal["chordal", "poses"] = "chordal",
     robust: Robust | None = None,
-    limits: Limits = Limits(),
+    limits: Limits | None = None,
     structure: Structure | None = None,
 ) -> Solution:
     """Return the poses of least cost.
@@ -44,13 +42,30 @@ def solve(
 
     Args:
         graph: vertices and edges.
-        start: "chordal" finds the first guess from the edges, and needs none; "poses" begins at the graph's own,
-            for a graph that has only grown a little.
+        start: "chordal" finds the first guess from the edges; "poses" begins at the graph's own, for one that
+            was solved before and has grown a little.
         robust: which edges may be wrong; None: all are trusted.
-        limits: when to end.
+        limits: when to end; None: the usual ones.
         structure: of this graph, where it is known from an earlier solve.
     """
-    structure = structure or structure_of(graph)
+    with one_thread():
+        return _solve(graph, start, robust, limits or Limits(), structure or structure_of(graph))
+
+
+def compile_for(graph: PoseGraph) -> None:
+    """Compile what a solve of this graph needs, as far as no graph of similar size has done so already."""
+    structure = structure_of(graph)
+    whole = padded(graph, structure)
+    jax.block_until_ready(_point(whole, structure, whole.graph.poses, np.ones(len(structure.i))))
+
+
+def _solve(
+    graph: PoseGraph,
+    start: Literal["chordal", "poses"],
+    robust: Robust | None,
+    limits: Limits,
+    structure: Structure,
+) -> Solution:
     whole = padded(graph, structure)
     own = _point(whole, structure, whole.graph.poses, np.ones(len(structure.i)))
     initial_cost = float(own.cost)
@@ -68,7 +83,7 @@ def solve(
     return Solution(
         poses=_unpadded(descent.point.poses, len(structure.held)),
         cost=descent.point.cost,
-        weights=jnp.asarray(weights),
+        weights=jax.device_put(weights),
         initial_cost=own.cost,
         iterations=descent.iterations,
         status=descent.status,
@@ -78,7 +93,7 @@ def solve(
 def marginal_covariances(
     graph: PoseGraph, solution: Solution, vertices: Sequence[int], structure: Structure | None = None
 ) -> NDArray[np.float64]:
-    """Return the covariances (k, d, d) of poses' right perturbations, rotation first; 0 of a vertex that is held.
+    """Return covariances (k, d, d) of poses' right perturbations, rotation first; 0 of held vertices.
 
     They are blocks of the inverse of the Gauss-Newton Hessian J' Omega J at the solution, as in gtsam.
 
@@ -95,26 +110,28 @@ def marginal_covariances(
     whole = padded(graph, structure)
     poses = padded_poses(solution.poses, len(whole.graph.fixed))
     equations = Equations.at(_point(whole, structure, poses, np.asarray(solution.weights)), structure)
-    try:
-        factor = factorise(structure.plan, np.concatenate([equations.diagonal, equations.pairs]))
-    except NotPositiveDefiniteError as error:
-        raise LioJaxError("the edges leave a pose open: there is no covariance of it.") from error
+    blocks = np.concatenate([equations.diagonal, equations.pairs])
     size = structure.tangent_size
     covariances = np.zeros((len(vertices), size, size))
     unknown = structure.unknown[np.asarray(vertices, np.int64)]
     asked = np.flatnonzero(unknown < structure.count)
-    for some in np.array_split(asked, -(-len(asked) // _VERTICES_AT_ONCE) or 1):
-        columns = np.zeros((structure.count, size, len(some), size))
-        columns[unknown[some], :, np.arange(len(some))] = np.eye(size)
-        inverse = solve_factored(factor, columns.reshape(structure.count, size, -1)).reshape(columns.shape)
-        covariances[some] = inverse[unknown[some], :, np.arange(len(some))]
+    try:
+        with one_thread():
+            factor = factorise(structure.plan, blocks)
+            for some in np.array_split(asked, -(-len(asked) // _VERTICES_AT_ONCE) or 1):
+                columns = np.zeros((structure.count, size, len(some), size))
+                columns[unknown[some], :, np.arange(len(some))] = np.eye(size)
+                inverse = solve_factored(factor, columns.reshape(structure.count, size, -1))
+                covariances[some] = inverse.reshape(columns.shape)[unknown[some], :, np.arange(len(some))]
+    except NotPositiveDefiniteError as error:
+        raise LioJaxError("the edges leave a pose open: there is no covariance of it.") from error
     return covariances
 
 
 def _point(whole: Padded, structure: Structure, poses: Poses, weights: NDArray[np.float64]) -> Point:
-    still = jnp.zeros((len(whole.places.unknown) + 1, structure.tangent_size), whole.graph.information.dtype)
-    return point_after(poses, still, padded_weights(weights, whole), whole)
+    still = np.zeros((len(whole.places.unknown) + 1, structure.tangent_size), whole.graph.information.dtype)
+    return point_after(poses, jax.device_put(still), padded_weights(weights, whole), whole)
 
 
 def _unpadded(poses: Poses, count: int) -> Poses:
-    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[:count]), poses)
+    return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[:count]), poses)

@@ -1,4 +1,4 @@
-"""What a pose graph's edges connect: its parts, its unknowns, and where an edge adds to the normal equations."""
+"""What a pose graph's edges connect: its parts, its unknowns, and the pairs of unknowns that are coupled."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,8 +25,8 @@ class Structure:
     part: NDArray[np.int64]
     """(n,) which connected part of the graph each vertex is in, counted from 0."""
     held: NDArray[np.bool_]
-    """(n,) vertices that keep their pose: the fixed ones, and the first of each part that nothing else ties to
-    the world."""
+    """(n,) vertices that keep their pose: the fixed ones, and the first of each part that nothing ties to the
+    world."""
     tangent_size: int
 
     @property
