@@ -42,6 +42,9 @@ class Problem(eqx.Module):
     directions: Callable[[Array, Any], tuple[Array, Array]] | None = None
     """``(root, inputs) -> B (d, k), C (k, d)``: the probe feels a step dx of the root as it would B C dx, so
     that k of its derivatives will do. None: the identity."""
+    solve_slope: Callable[[Array, Any, Any, Array], Array] | None = None
+    """``(root, selection, inputs, right) -> (dr/dx)^-1 right`` for a root so large that its slope is sparse;
+    JAX must know its transpose. None: the slope is a dense matrix."""
 
 
 def implicit(problem: Problem, inputs: Any) -> Solution:
@@ -74,6 +77,8 @@ def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
     smooth, probed_push, rest = jax.jvp(
         lambda moving: probe(root, moving), (moving,), (inputs_dot,), has_aux=True
     )
+    if problem.solve_slope is not None:
+        return solution, _by_sparse_slope(problem, solution, moving, fixed, inputs_dot)
     forth = back = jnp.eye(len(root), dtype=root.dtype)
     if problem.directions is not None:
         forth, back = problem.directions(root, inputs)
@@ -103,6 +108,29 @@ def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
     probed_dot = jax.tree.map(jnp.add, probed_push, felt(root_dot))
     _, reported_dot = jax.jvp(report, (root, smooth, moving), (root_dot, probed_dot, inputs_dot))
     return solution, Solution(root_dot, _still(solution.selection), _tangent(reported_dot))
+
+
+def _by_sparse_slope(
+    problem: Problem, solution: Solution, moving: Any, fixed: Any, inputs_dot: Any
+) -> Solution:
+    """Return the solution's tangent where the problem inverts its slope itself."""
+
+    def residual(root: Array, moving: Any) -> Array:
+        inputs = eqx.combine(moving, fixed)
+        probed = problem.probe(root, solution.selection, inputs)
+        return problem.residual(root, probed, solution.selection, inputs)
+
+    def report(root: Array, moving: Any) -> Any:
+        inputs = eqx.combine(moving, fixed)
+        probed = problem.probe(root, solution.selection, inputs)
+        return problem.report(root, probed, solution.selection, inputs)
+
+    root = solution.root
+    assert problem.solve_slope is not None
+    _, push = jax.jvp(lambda moving: residual(root, moving), (moving,), (inputs_dot,))
+    root_dot = -problem.solve_slope(root, solution.selection, eqx.combine(moving, fixed), push)
+    _, reported_dot = jax.jvp(report, (root, moving), (root_dot, inputs_dot))
+    return Solution(root_dot, _still(solution.selection), _tangent(reported_dot))
 
 
 def known(value: _Value, function: Callable[..., _Value], *inputs: Any) -> _Value:

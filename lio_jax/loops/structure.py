@@ -88,8 +88,23 @@ def structure_of(graph: PoseGraph, used: NDArray[np.bool_] | None = None) -> Str
         graph: whose connections are asked for.
         used: (e,) edges that count; None: all.
     """
-    i, j, kind, fixed = (np.asarray(leaf) for leaf in (graph.i, graph.j, graph.kind, graph.fixed))
-    i, j, kind = i.astype(np.int64), j.astype(np.int64), kind.astype(np.int64)
+    return structure_from(
+        *(np.asarray(leaf, np.int64) for leaf in (graph.i, graph.j, graph.kind)),
+        np.asarray(graph.fixed),
+        graph.information.shape[-1],
+        used,
+    )
+
+
+def structure_from(
+    i: NDArray[np.int64],
+    j: NDArray[np.int64],
+    kind: NDArray[np.int64],
+    fixed: NDArray[np.bool_],
+    tangent_size: int,
+    used: NDArray[np.bool_] | None = None,
+) -> Structure:
+    """Return the structure of a graph whose fields these are."""
     used = np.ones(len(i), bool) if used is None else used
     part = parts_of(len(fixed), i[used], j[used])
     tied = np.zeros(part.max(initial=-1) + 1, bool)
@@ -98,7 +113,7 @@ def structure_of(graph: PoseGraph, used: NDArray[np.bool_] | None = None) -> Str
     first = np.unique(part, return_index=True)[1]
     held = fixed.copy()
     held[first[~tied]] = True
-    return Structure(i, j, kind, used, part, held, graph.information.shape[-1])
+    return Structure(i, j, kind, used, part, held, tangent_size)
 
 
 def parts_of(count: int, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.int64]:
