@@ -58,12 +58,14 @@ def _root(limits: Limits, inputs: tuple[PoseGraph, Array]) -> Root:
     return Root(unmoved, jax.tree.leaves(poses)[0], poses)
 
 
+@jax.jit
 def _poses_at(step: Float[Array, " u"], numbers: Array, graph: PoseGraph, held: Bool[Array, " n"]) -> Poses:
     """Return the poses a step away from the solution; held ones are those of the graph."""
     found = moved(type(graph.poses)(numbers), step.reshape(len(held), -1))
     return jax.tree.map(lambda own, found: jnp.where(held[:, None], own, found), graph.poses, found)
 
 
+@jax.jit
 def _gradient(
     step: Float[Array, " u"], numbers: Array, graph: PoseGraph, held: Bool[Array, " n"]
 ) -> Float[Array, " u"]:
@@ -74,6 +76,7 @@ def _gradient(
     return jnp.where(fixed, step, jax.grad(cost)(step))
 
 
+@jax.jit
 def _solve_hessian(
     step: Float[Array, " u"], numbers: Array, inputs: tuple[PoseGraph, Array], right: Float[Array, " u"]
 ) -> Float[Array, " u"]:
