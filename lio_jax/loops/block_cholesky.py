@@ -7,16 +7,16 @@ sparse symmetric linear equations", 1983.
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 from threadpoolctl import ThreadpoolController
 
-from lio_jax.loops.elimination_tree import EliminationTree, Front, elimination_tree
+from lio_jax.loops.elimination_tree import EliminationTree, elimination_tree
 
-_Runs = tuple[tuple[slice, slice], ...]
+_Run = tuple[slice, slice]
+_Runs = tuple[_Run, ...]
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def plan_of(count: int, pairs: NDArray[np.int64], size: int, tree: EliminationTr
         size,
         _places(tree, pairs, size, widths, offsets),
         tuple(offsets.tolist()),
-        tuple(_share(front, fronts, size) for front in fronts),
+        _shares(tree, size),
         tuple(slice(front.start * size, front.stop * size) for front in fronts),
         tuple((front.rows[:, None] * size + np.arange(size)).ravel() for front in fronts),
     )
@@ -105,26 +105,38 @@ def _places(
     )
 
 
-def _share(front: Front, fronts: tuple[Front, ...], size: int) -> _Share | None:
-    if front.parent < 0:
-        return None
-    parent = fronts[front.parent]
-    own = front.rows < parent.stop
-    panel = front.rows[own] - parent.start
-    rest = np.searchsorted(parent.rows, front.rows[~own])
-    return _Share(_runs(panel, 0, size), _runs(rest, len(panel), size))
-
-
-def _runs(places: NDArray[np.int64], offset: int, size: int) -> _Runs:
-    """Return consecutive places as slices of scalars: (in the child, in the parent)."""
-    cuts = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), len(places)]
+def _shares(tree: EliminationTree, size: int) -> tuple[_Share | None, ...]:
+    """Return where what each front is left with lies in its parent, as runs of consecutive rows."""
+    fronts, count = tree.fronts, len(tree.position)
+    rows = np.concatenate([front.rows for front in fronts] + [np.zeros(0, np.int64)])
+    lengths = np.array([len(front.rows) for front in fronts], np.int64)
+    begins = np.cumsum(lengths) - lengths
+    child = np.repeat(np.arange(len(fronts)), lengths)
+    parent = np.array([front.parent for front in fronts], np.int64)[child]
+    starts = np.array([front.start for front in fronts], np.int64)[parent]
+    in_panel = rows < np.array([front.stop for front in fronts], np.int64)[parent]
+    found = np.searchsorted(child * count + rows, parent * count + rows) - begins[parent]
+    place = np.where(in_panel, rows - starts, found)
+    new = np.ones(len(rows), bool)
+    new[1:] = (np.diff(child) != 0) | np.diff(in_panel) | (np.diff(place) != 1)
+    first = np.flatnonzero(new)
+    stop = np.append(first[1:], len(rows))
+    within = first - begins[child[first]]
+    runs = zip(
+        child[first].tolist(),
+        in_panel[first].tolist(),
+        (within * size).tolist(),
+        (place[first] * size).tolist(),
+        ((stop - first) * size).tolist(),
+        strict=True,
+    )
+    panel: list[list[_Run]] = [[] for _ in fronts]
+    rest: list[list[_Run]] = [[] for _ in fronts]
+    for number, own, at, to, length in runs:
+        (panel if own else rest)[number].append((slice(at, at + length), slice(to, to + length)))
     return tuple(
-        (
-            slice((offset + a) * size, (offset + b) * size),
-            slice(int(places[a]) * size, (int(places[a]) + b - a) * size),
-        )
-        for a, b in pairwise(cuts)
-        if b > a
+        _Share(tuple(own), tuple(others)) if front.parent >= 0 else None
+        for front, own, others in zip(fronts, panel, rest, strict=True)
     )
 
 
