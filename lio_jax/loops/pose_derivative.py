@@ -119,9 +119,9 @@ def _solve_on_host(
     """Solve for one right-hand side or a batch of them."""
     hessians, right = np.asarray(hessians, np.float64), np.asarray(right)
     size = hessians.shape[-1] // 2
-    ends = [np.asarray(leaf, np.int64).reshape(-1) for leaf in (i, j, kind)]
+    i, j, kind = (np.asarray(leaf, np.int64).reshape(-1) for leaf in (i, j, kind))
     held = np.asarray(held).reshape(-1)
-    structure = structure_from(*ends, held, size)
+    structure = structure_from(i, j, kind, held, size)
     free = ~structure.held
     columns = right.reshape(-1, len(held), size).astype(np.float64)
     solved = columns.copy()

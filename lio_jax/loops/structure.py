@@ -89,7 +89,9 @@ def structure_of(graph: PoseGraph, used: NDArray[np.bool_] | None = None) -> Str
         used: (e,) edges that count; None: all.
     """
     return structure_from(
-        *(np.asarray(leaf, np.int64) for leaf in (graph.i, graph.j, graph.kind)),
+        np.asarray(graph.i, np.int64),
+        np.asarray(graph.j, np.int64),
+        np.asarray(graph.kind, np.int64),
         np.asarray(graph.fixed),
         graph.information.shape[-1],
         used,
