@@ -17,6 +17,8 @@ _LEAST_DAMPING, _LARGEST_DAMPING = 1e-10, 1e8
 """Relative to the diagonal of the normal equations."""
 _FAITHFUL = 0.5
 """A step that gains this share of what it promised may be followed by a less damped one."""
+_ROUNDING = 1e-12
+"""Relative; smaller changes of the cost may be those of its sum."""
 _NEGLIGIBLE_PER_EDGE = 1e-14
 """A decrease of the cost that is only rounding, where all edges agree."""
 
@@ -78,7 +80,7 @@ def descend(
             equations = Equations.at(point, structure)
             if gained > _FAITHFUL * promised:
                 damping = damping / 10 if damping > _LEAST_DAMPING else 0.0
-        elif last:
+        elif last or (promised >= 0 and max(promised, -gained) <= _ROUNDING * cost):
             return Descent(point, iterations, "converged")
         else:
             failures += 1
