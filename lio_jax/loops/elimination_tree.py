@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-_TOGETHER = 10
+_TOGETHER = 16
 """So few nodes are always eliminated with their parent: a product of matrices beats its own overhead."""
 _ZEROS = 0.2
 """Nodes join their parent while at most this share of what they fill is zero."""
