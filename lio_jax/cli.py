@@ -301,6 +301,28 @@ def ablate(
     command(spec, out, scheduler, report, retry_failed)
 
 
+@app.command(name="optimize-graph")
+def optimize_graph(
+    graph: Positional[Annotated[Path, arg(metavar="IN.g2o")]],
+    out: Positional[Annotated[Path, arg(metavar="OUT.g2o")]],
+    robust: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+) -> None:
+    """Find the poses that agree best with all edges of a pose graph.
+
+    Args:
+        graph: Pose graph, in space or in the plane; needs edges only, and may have vertices and FIX lines.
+        out: The same graph with the poses found.
+        robust: Distrust loops that contradict the rest.
+        json: Print one JSON object instead of a table.
+    """
+    from lio_jax.commands.optimize_graph import optimize_graph as command
+    from lio_jax.commands.runtime import prepare_jax
+
+    prepare_jax()
+    command(graph, out, robust, json)
+
+
 @app.command(name="calibrate-imu")
 def calibrate_imu(
     data: Positional[Annotated[Path, arg(metavar="STATIC_DATA")]],

@@ -1,13 +1,19 @@
-"""Write pose graphs in the g2o text format (VERTEX_SE3:QUAT, EDGE_SE3:QUAT)."""
+"""Write pose graphs in the g2o text format (VERTEX and EDGE of SE3:QUAT and SE2, FIX)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import jaxlie
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.files import atomic_path
+from lio_jax.loops.graph import PRIOR, PoseGraph, Poses
+from lio_jax.loops.host_poses import numbers_of
+
+_Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -27,17 +33,63 @@ def write_g2o(path: Path, poses: NDArray[np.float64], edges: list[Edge]) -> None
 
     The file holds translation first; like gtsam, rotations count as rotation vectors.
     """
-    order = np.array([3, 4, 5, 0, 1, 2])
-    upper = np.triu_indices(6)
-    lines = [f"VERTEX_SE3:QUAT {index} {_pose(pose)}" for index, pose in enumerate(poses)]
-    for edge in edges:
-        information = edge.information[np.ix_(order, order)]
-        numbers = " ".join(f"{value:.9g}" for value in information[upper])
-        lines.append(f"EDGE_SE3:QUAT {edge.i} {edge.j} {_pose(edge.T_i_j)} {numbers}")
+    measured = np.array([edge.T_i_j for edge in edges]).reshape(-1, 4, 4)
+    information = np.array([edge.information for edge in edges]).reshape(-1, 6, 6)
+    ends = np.array([(edge.i, edge.j) for edge in edges], np.int64).reshape(-1, 2)
+    lines = _lines("VERTEX_SE3:QUAT", np.arange(len(poses))[:, None], _of_matrices(poses))
+    lines += _lines("EDGE_SE3:QUAT", ends, np.hstack([_of_matrices(measured), _triangle(information)]))
+    _write(path, lines)
+
+
+def write_graph(path: Path, graph: PoseGraph, ids: NDArray[np.int64]) -> None:
+    """Write a graph of odometry and loops.
+
+    Args:
+        path: of the file.
+        graph: without priors and positions, which the format's usual tags don't tell.
+        ids: (n,) numbers of the vertices.
+
+    Raises:
+        ValueError: there are priors or positions.
+    """
+    if np.any(np.asarray(graph.kind) >= PRIOR):
+        raise ValueError("g2o's usual tags tell neither priors nor positions")
+    kind = "SE3:QUAT" if isinstance(graph.poses, jaxlie.SE3) else "SE2"
+    ends = ids[np.stack([np.asarray(graph.i), np.asarray(graph.j)], -1)]
+    information = _triangle(np.asarray(graph.information, np.float64))
+    lines = _lines(f"VERTEX_{kind}", ids[:, None], _of_poses(graph.poses))
+    lines += [f"FIX {number}" for number in ids[np.asarray(graph.fixed)]]
+    lines += _lines(f"EDGE_{kind}", ends, np.hstack([_of_poses(graph.measurement), information]))
+    _write(path, lines)
+
+
+def _of_matrices(poses: _Array) -> _Array:
+    """Return rows x y z qx qy qz qw."""
+    quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat().reshape(-1, 4)
+    return np.hstack([poses[:, :3, 3], quaternion])
+
+
+def _of_poses(poses: Poses) -> _Array:
+    """Return rows x y z qx qy qz qw, in the plane x y angle."""
+    numbers = numbers_of(poses)
+    if isinstance(poses, jaxlie.SE3):
+        return numbers[:, [4, 5, 6, 1, 2, 3, 0]]
+    return np.column_stack([numbers[:, 2:], np.arctan2(numbers[:, 1], numbers[:, 0])])
+
+
+def _triangle(information: _Array) -> _Array:
+    """Return the upper triangles, translation first, of matrices that count rotation first."""
+    size = information.shape[-1]
+    turned = np.roll(information, -3 if size == 6 else -1, axis=(1, 2))
+    return turned[:, *np.triu_indices(size)]
+
+
+def _lines(tag: str, integers: NDArray[np.int64], numbers: _Array) -> list[str]:
+    form = " ".join([tag, *["%d"] * integers.shape[1], *["%.15g"] * numbers.shape[1]])
+    rows = zip(integers.tolist(), numbers.tolist(), strict=True)
+    return [form % (*whole, *real) for whole, real in rows]
+
+
+def _write(path: Path, lines: Sequence[str]) -> None:
     with atomic_path(path) as aside:
         aside.write_text("\n".join(lines) + "\n")
-
-
-def _pose(pose: NDArray[np.float64]) -> str:
-    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
-    return " ".join(f"{value:.12g}" for value in (*pose[:3, 3], *quaternion))

@@ -1,0 +1,81 @@
+"""``lio-jax optimize-graph``: solve a pose graph in a g2o file."""
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import equinox as eqx
+import numpy as np
+
+from lio_jax.commands.runtime import say
+from lio_jax.core.errors import LioJaxError, UsageError
+from lio_jax.loops.chordal import chordal_poses
+from lio_jax.loops.g2o import write_graph
+from lio_jax.loops.g2o_reader import G2oFile, read_g2o
+from lio_jax.loops.graduated import Robust
+from lio_jax.loops.graph import LOOP, Solution
+from lio_jax.loops.pose_graph import compile_for, solve
+from lio_jax.loops.structure import structure_of
+
+_NAMED = 5
+"""So many distrusted edges are named."""
+
+
+def optimize_graph(source: Path, out: Path, robust: bool, as_json: bool) -> None:
+    """Solve the graph, write it with the poses found, and print what it took.
+
+    Raises:
+        UsageError: the result would replace the input, or has no folder to go to.
+        LioJaxError: the file is no pose graph, or its numbers have no solution.
+    """
+    if out.exists() and source.exists() and out.samefile(source):
+        raise UsageError(f"{out}: the result would replace the input; choose another name.")
+    if out.is_dir() or not out.parent.is_dir():
+        raise UsageError(f"{out}: not a file in a folder that exists; choose another path.")
+    file = read_g2o(source)
+    for note in file.notes:
+        say(f"note: {source}: {note}")
+    graph = file.graph
+    if not file.has_poses:
+        graph = eqx.tree_at(lambda graph: graph.poses, graph, chordal_poses(graph, structure_of(graph)))
+        file = replace(file, graph=graph)
+    begin = time.perf_counter()
+    compile_for(graph)
+    compiled = time.perf_counter()
+    solution = solve(graph, robust=Robust() if robust else None)
+    solve_s = time.perf_counter() - compiled
+    if solution.status == "not finite":
+        raise LioJaxError(f"{source}: the cost is not a finite number; some edge or weight is far too large.")
+    if solution.status != "converged":
+        say(f"warning: {source}: not converged ({solution.status}); the poses are the best ones found.")
+    if robust:
+        say(_distrusted(file, solution))
+    write_graph(out, eqx.tree_at(lambda graph: graph.poses, graph, solution.poses), file.ids)
+    result = {
+        "initial_cost": float(solution.initial_cost),
+        "final_cost": float(solution.cost),
+        "iterations": solution.iterations,
+        "status": solution.status,
+        "solve_s": solve_s,
+    }
+    if as_json:
+        print(json.dumps(result, allow_nan=False))
+        return
+    loops = int(np.sum(np.asarray(graph.kind) == LOOP))
+    print(f"graph       {len(file.ids)} vertices, {len(graph.i)} edges, {loops} of them loops")
+    print(f"cost        {result['initial_cost']:.7g} -> {result['final_cost']:.7g}")
+    print(f"iterations  {solution.iterations} ({solution.status})")
+    print(f"time        {solve_s:.3f} s, and {compiled - begin:.3f} s to compile")
+    print(f"written     {out}")
+
+
+def _distrusted(file: G2oFile, solution: Solution) -> str:
+    graph = file.graph
+    wrong = np.flatnonzero(np.asarray(solution.weights) < 0.5)
+    loops = int(np.sum(np.asarray(graph.kind) == LOOP))
+    if not len(wrong):
+        return f"note: none of {loops} loops contradicts the rest."
+    ends = zip(file.ids[np.asarray(graph.i)[wrong]], file.ids[np.asarray(graph.j)[wrong]], strict=True)
+    named = ", ".join(f"{i}-{j}" for i, j in list(ends)[:_NAMED])
+    return f"note: {len(wrong)} of {loops} loops distrusted: {named}{', ...' if len(wrong) > _NAMED else ''}."

@@ -1,0 +1,87 @@
+"""Pose graphs as pytrees of arrays.
+
+Tangents of poses, rows and columns of information matrices and covariances count rotation (rad) before
+translation (m): (rx, ry, rz, x, y, z) in space, (angle, x, y) in the plane. They belong to right
+perturbations, T exp(d).
+"""
+
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int
+
+Poses = jaxlie.SEBase
+"""SE3 or SE2, all of one kind, with one batch axis."""
+
+ODOMETRY, LOOP, PRIOR, POSITION = range(4)
+"""Kinds of edge. A prior states a vertex's pose, a position its translation, such as a GPS fix."""
+
+
+class PoseGraph(eqx.Module):
+    """Vertices and what was measured about them."""
+
+    poses: Poses
+    """(n,) estimates, T_world_vertex."""
+    i: Int[Array, " e"]
+    """First vertex of each edge; of a prior and of a position the same as ``j``."""
+    j: Int[Array, " e"]
+    """Second vertex."""
+    measurement: Poses
+    """(e,) T_i_j; T_world_j of a prior; of a position only the translation counts."""
+    information: Float[Array, "e d d"]
+    """Inverse covariance of the measurement's right perturbation; of a position, of its coordinates in the
+    world, with zeros for the rotation."""
+    kind: Int[Array, " e"]
+    """ODOMETRY, LOOP, PRIOR or POSITION."""
+    fixed: Bool[Array, " n"]
+    """Vertices that keep their pose."""
+
+
+Status = Literal["converged", "iteration limit", "no further decrease", "not finite"]
+"""How a solve ended. "no further decrease": no step, however short, lowered the cost."""
+
+
+class Solution(eqx.Module):
+    """What a solve found."""
+
+    poses: Poses
+    """(n,) T_world_vertex."""
+    cost: Float[Array, ""]
+    """Half the weighted sum of squared whitened residuals."""
+    weights: Float[Array, " e"]
+    """Of each edge's information: 1, or below where a robust solve distrusts an edge."""
+    initial_cost: Float[Array, ""]
+    """Cost of the graph's own poses, all edges trusted."""
+    iterations: int = eqx.field(static=True)
+    """Linear systems solved."""
+    status: Status = eqx.field(static=True)
+
+
+def rotation_first(tangent_or_matrix: Float[Array, "*b"], axes: int = 1) -> Float[Array, "*b"]:
+    """Return jaxlie's tangents (translation first) in this project's order.
+
+    Args:
+        tangent_or_matrix: its last ``axes`` axes are of a tangent's size, 6 or 3.
+        axes: 1 for tangents, 2 for matrices.
+    """
+    size = tangent_or_matrix.shape[-1]
+    return jnp.roll(tangent_or_matrix, 3 if size == 6 else 1, axis=tuple(range(-axes, 0)))
+
+
+def moved(poses: Poses, step: Float[Array, "n d"]) -> Poses:
+    """Return T exp(step)."""
+    size = step.shape[-1]
+    return poses @ type(poses).exp(jnp.roll(step, -3 if size == 6 else -1, axis=-1))
+
+
+def picked(poses: Poses, index: Int[Array, " k"]) -> Poses:
+    """Return the poses at these places."""
+    return jax.tree.map(lambda leaf: leaf[index], poses)
+
+
+def tangent_size(poses: Poses) -> int:
+    """Return 6 in space, 3 in the plane."""
+    return poses.tangent_dim

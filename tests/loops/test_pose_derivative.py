@@ -1,0 +1,117 @@
+"""Derivatives of solved poses against central differences."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+
+from lio_jax.loops.graph import POSITION
+from lio_jax.loops.host_poses import translations
+from lio_jax.loops.pose_derivative import solved_poses
+from lio_jax.loops.pose_graph import Limits, solve
+from tests.loops.graphs import graph_of, walk, with_edges, with_poses
+
+STEP = 1e-5
+
+
+@pytest.fixture(params=[jaxlie.SE3, jaxlie.SE2], ids=["space", "plane"])
+def graph(request):
+    """Return a graph whose residuals are large, so that the exact Hessian is not Gauss-Newton's."""
+    rng = np.random.default_rng(2)
+    return graph_of(walk(request.param, 8, rng), [(0, 5), (2, 7)], rng, noise=5.0, scale=30.0)
+
+
+def loss(poses):
+    numbers = jax.tree.leaves(poses)[0]
+    return jnp.sum(jnp.sin(numbers) * jnp.arange(numbers.size).reshape(numbers.shape) / numbers.size)
+
+
+def changed(graph, change, t):
+    """Return the graph after a share of a change of its measurements, information and fixed pose."""
+    twist, scale, shift = change
+    measurement = graph.measurement @ type(graph.poses).exp(t * twist)
+    own = jnp.concatenate(
+        [
+            (at_first(graph.poses) @ type(graph.poses).exp(t * shift)).parameters()[None],
+            graph.poses.parameters()[1:],
+        ]
+    )
+    graph = with_poses(graph, type(graph.poses)(own))
+    return eqx.tree_at(
+        lambda graph: (graph.measurement, graph.information),
+        graph,
+        (measurement, graph.information * jnp.exp(t * scale)[:, None, None]),
+    )
+
+
+def at_first(poses):
+    return jax.tree.map(lambda leaf: leaf[0], poses)
+
+
+def change_of(graph, seed):
+    rng = np.random.default_rng(seed)
+    size = graph.poses.tangent_dim
+    edges = len(graph.i)
+    return tuple(jnp.asarray(rng.normal(size=shape)) for shape in ((edges, size), (edges,), (size,)))
+
+
+@pytest.mark.parametrize("only", [0, 1, 2], ids=["measurements", "weights", "fixed pose"])
+def test_derivative_along_a_change_is_the_central_difference(graph, only):
+    change = tuple(part * (number == only) for number, part in enumerate(change_of(graph, 1)))
+
+    def along(t):
+        return loss(solved_poses(changed(graph, change, t)))
+
+    expected = (float(along(STEP)) - float(along(-STEP))) / (2 * STEP)
+    assert abs(expected) > 1e-3
+    _, forward = jax.jvp(along, (0.0,), (1.0,))
+    assert float(forward) == pytest.approx(expected, rel=2e-6)
+    assert float(jax.grad(along)(0.0)) == pytest.approx(expected, rel=2e-6)
+
+
+def test_gradient_by_all_weights(graph):
+    def by_weights(logs):
+        return loss(
+            solved_poses(
+                eqx.tree_at(lambda g: g.information, graph, graph.information * jnp.exp(logs)[:, None, None])
+            )
+        )
+
+    logs = jnp.zeros(len(graph.i))
+    gradient = jax.grad(by_weights)(logs)
+    for k in (0, 4, 8):
+        shift = STEP * jnp.eye(len(logs))[k]
+        expected = (float(by_weights(shift)) - float(by_weights(-shift))) / (2 * STEP)
+        assert float(gradient[k]) == pytest.approx(expected, rel=1e-5, abs=1e-9)
+    np.testing.assert_allclose(jax.jacfwd(by_weights)(logs), gradient, rtol=1e-9, atol=1e-12)
+
+
+def test_gradient_by_positions(graph):
+    """With a GPS-like position, whose own coordinates move the graph."""
+    size, turning = graph.poses.tangent_dim, 3 if graph.poses.tangent_dim == 6 else 1
+    information = np.zeros((2, size, size))
+    information[:, turning:, turning:] = 20 * np.eye(size - turning)
+    fixes = jnp.asarray(translations(graph.poses)[[4, 7]] + 0.3)
+
+    def by_fixes(fixes):
+        poses = type(graph.poses).exp(jnp.pad(fixes, ((0, 0), (0, turning))))
+        return loss(solved_poses(with_edges_traced(graph, poses, information)))
+
+    gradient = jax.grad(by_fixes)(fixes)
+    for k in range(2):
+        shift = jnp.zeros_like(fixes).at[k, 1].set(STEP)
+        expected = (float(by_fixes(fixes + shift)) - float(by_fixes(fixes - shift))) / (2 * STEP)
+        assert float(gradient[k, 1]) == pytest.approx(expected, rel=1e-5)
+
+
+def with_edges_traced(graph, poses, information):
+    graph = with_edges(graph, [4, 7], [4, 7], type(poses).identity((2,)), information, POSITION)
+    numbers = jnp.concatenate([jax.tree.leaves(graph.measurement)[0][:-2], jax.tree.leaves(poses)[0]])
+    return eqx.tree_at(lambda g: g.measurement, graph, type(poses)(numbers))
+
+
+def test_values_are_those_of_the_solve(graph):
+    expected = jax.tree.leaves(solve(graph, limits=Limits(tolerance=1e-14)).poses)[0]
+    np.testing.assert_allclose(jax.tree.leaves(solved_poses(graph))[0], expected, atol=1e-6)
