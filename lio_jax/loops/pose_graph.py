@@ -90,6 +90,11 @@ def _solve(
     )
 
 
+_OPEN_POSE = "the edges leave a pose open: there is no covariance of it."
+_SINGULAR = 1e12
+"""Variance times own information above which a matrix is singular as far as numbers tell."""
+
+
 def marginal_covariances(
     graph: PoseGraph, solution: Solution, vertices: Sequence[int], structure: Structure | None = None
 ) -> NDArray[np.float64]:
@@ -123,8 +128,13 @@ def marginal_covariances(
                 columns[unknown[some], :, np.arange(len(some))] = np.eye(size)
                 inverse = solve_factored(factor, columns.reshape(structure.count, size, -1))
                 covariances[some] = inverse.reshape(columns.shape)[unknown[some], :, np.arange(len(some))]
-    except NotPositiveDefiniteError as error:
-        raise LioJaxError("the edges leave a pose open: there is no covariance of it.") from error
+    except NotPositiveDefiniteError:
+        raise LioJaxError(_OPEN_POSE) from None
+    # rounding may leave a pivot of a singular matrix above zero
+    variances = np.diagonal(covariances[asked], axis1=1, axis2=2)
+    own = np.diagonal(equations.diagonal[unknown[asked]], axis1=1, axis2=2)
+    if np.any(variances * own > _SINGULAR):
+        raise LioJaxError(_OPEN_POSE)
     return covariances
 
 

@@ -212,9 +212,14 @@ def step(
         map=submap,
     )
     corners, surfaces = len(placed.corner), len(placed.surface)
+    unfinished = (match.status == CONVERGED) & (smoothed.status != CONVERGED) & ~first
     offset = (frames.corner.origin - frames.surface.origin).astype(placed.corner.dtype)
     return new_state, Output(
-        registration=dataclasses.replace(match, T_world_lidar=lidar_pose(nav)),
+        registration=dataclasses.replace(
+            match,
+            T_world_lidar=lidar_pose(nav),
+            status=jnp.where(unfinished, ITERATION_LIMIT, match.status),
+        ),
         lost=lost,
         nis=jnp.zeros_like(end),
         nis_dof=jnp.int32(0),
