@@ -39,7 +39,7 @@ from lio_jax.recipes.output import Output
 from lio_jax.recipes.pose_limits import drawn_to_tilt, measured_attitude, within_limits
 from lio_jax.recipes.smoothed_odometry import match_as_measurement, opened, runs_away
 from lio_jax.registration.feature_map import empty_feature_map
-from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES
+from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES
 from lio_jax.registration.lines_and_planes import FeaturePoints
 from lio_jax.registration.rounds import match_in_rounds
 from lio_jax.registration.submap import ScanToSubmap, Submap, with_scan
