@@ -46,7 +46,7 @@ def keep_observed(
     """Return a scan match without its degenerate directions, and which they are, weakest first.
 
     A direction with at most a share of the strongest direction's information is left to the prediction: what
-    little the scan seems to know there is the map's roughness (Zhang & Singh, "On degeneracy of
+    little the scan seems to know there is the map's roughness (Zhang, Kaess & Singh, "On degeneracy of
     optimization-based state estimation problems", ICRA 2016). Rotations are scaled by the scan's rms lever
     arm so that all six directions are in metres.
 

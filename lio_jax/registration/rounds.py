@@ -66,7 +66,7 @@ class Task(eqx.Module):
 def match_in_rounds(task: Task, rounds: int | Int32[Array, ""], max_iterations: int) -> Registration:
     """Find the pose at which the points fit their lines and planes best, by the task's robust measure.
 
-    Directions the matches do not constrain keep the prediction (Zhang & Singh, "On degeneracy of
+    Directions the matches do not constrain keep the prediction (Zhang, Kaess & Singh, "On degeneracy of
     optimization-based state estimation problems", ICRA 2016). Matches are kept in a later round if the
     points have moved less than ``params.registration.reassociation_distance`` since; a round whose first step
     ends the iteration is the last.

@@ -14,7 +14,7 @@ from lio_jax.data.trajectory import Trajectory
 from lio_jax.evaluation.evaluate import evaluate
 from lio_jax.tuning.named_objectives import objective_named
 from lio_jax.tuning.objective import Observed, TruePose
-from lio_jax.tuning.objectives import MeanOverScans, WeightedSum
+from lio_jax.tuning.objectives import MarginalLikelihood, MeanOverScans, WeightedSum
 from lio_jax.tuning.trajectory_objectives import AbsoluteError, RelativeError
 
 COUNT = 40
@@ -128,3 +128,25 @@ def test_an_unknown_objective_lists_those_there_are(text):
 def test_innovations_want_a_filter(name):
     with pytest.raises(UsageError, match="ate, rpe or map"):
         loss(MeanOverScans(objective_named(name).objective.loss), poses(0), poses(1))
+
+
+def test_the_marginal_likelihood_is_what_the_scans_after_the_opening_add():
+    totals = np.cumsum(np.random.default_rng(4).normal(30, 5, COUNT))
+    truth = TruePose(jaxlie.SE3(poses(1)[0]), jnp.array(True))
+    objective = MarginalLikelihood(skip=10)
+    sums = objective.start()
+    for number, total in enumerate(totals):
+        seen = dataclasses.replace(seen_at(poses(0)[number]), log_evidence=jnp.asarray(total))
+        sums = objective.add(sums, seen, truth)
+    expected = -(totals[-1] - totals[9]) / (COUNT - 10)
+    assert float(objective.value(sums)) == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_recipe_without_a_smoother_has_no_marginal_likelihood():
+    objective = objective_named("marginal").objective
+    with pytest.raises(UsageError, match=r"no smoother.*use lio_sam, or pose"):
+        objective.add(
+            objective.start(),
+            seen_at(poses(0)[0]),
+            TruePose(jaxlie.SE3(poses(1)[0]), jnp.array(True)),
+        )
