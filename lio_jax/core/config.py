@@ -219,6 +219,8 @@ def invalid_config(path: str, value: object) -> str:
         return "must be a power of two"
     if path == "config.knn.neighbours" and isinstance(value, int) and value < 3:
         return "must be at least 3: fewer points define no plane"
+    if path == "config.lio_sam.window" and isinstance(value, int) and value < 2:
+        return "must be at least 2: the smoother ties each state to the one before it"
     if path.endswith(".buckets") and (sorted(set(value)) != list(value) or value[0] < 1):  # type: ignore
         return "must be positive sizes in ascending order"
     if path == "config.data.vertical_correction_deg":

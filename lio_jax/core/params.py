@@ -191,11 +191,11 @@ class SubmapParams(eqx.Module):
     keyframe_angle: Scalar
     """... or one turned by this much, rad."""
     radius: Scalar
-    """Keyframes within this distance are matched with, m ..."""
+    """Keyframes within this distance are to be in the map, m; those that come back to it enter anew ..."""
     spacing: Scalar
-    """... but one per so many metres only ..."""
+    """... but one per so many metres only; the others' places are taken ..."""
     recent: Scalar
-    """... and all of the last so many seconds."""
+    """... once they are older than this, s."""
 
 
 class SmootherParams(eqx.Module):
@@ -208,7 +208,8 @@ class SmootherParams(eqx.Module):
     degenerate_sigma: Scalar
     """Of both, rad and m, where it was degenerate."""
     kernel: Scalar
-    """Scale of the robust kernel on scan matches, sigmas."""
+    """Scale of the robust kernel on scan matches, sigmas. Wide: a narrow one would take all matches for
+    outliers once the velocity is wrong."""
     position_sigma: Scalar
     """Of the first position, m."""
     tolerance: Scalar
@@ -358,7 +359,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "rotation_sigma": 0.05,
         "translation_sigma": 0.1,
         "degenerate_sigma": 1.0,
-        "kernel": 10.0,
+        "kernel": 1e6,
         "position_sigma": 0.01,
         "tolerance": 1e-3,
         "tilt_weight": 0.01,

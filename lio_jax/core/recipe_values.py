@@ -82,7 +82,8 @@ RECIPE_VALUES: dict[str, dict[str, Any]] = {
         "params.imu.accel_bias_walk": 6.4356659353532566e-05,
         "params.imu.gravity": 9.80511,
         "params.initial.rotation_sigma": 1e-2,
-        "params.initial.velocity_sigma": 1e4,
+        # LIO-SAM's 1e4 beside a sample's information is singular in double precision
+        "params.initial.velocity_sigma": 100.0,
         "params.initial.gyro_bias_sigma": 1e-3,
         "params.initial.accel_bias_sigma": 1e-3,
         "params.lidar.min_range": 1.0,
@@ -100,7 +101,6 @@ RECIPE_VALUES: dict[str, dict[str, Any]] = {
         "params.knn.min_score": 0.1,
         # keyframes within 50 m see farther than that
         "params.point_map.cube_side_length": 400.0,
-        "params.point_map.cube_margin": 0.1,
     },
 }
 """By recipe; paths as in a settings file."""

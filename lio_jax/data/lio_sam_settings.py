@@ -126,7 +126,7 @@ LIO_SAM = System(
         "numberOfCores": nothing("the machine's cores are used as JAX finds them"),
         "mappingProcessInterval": _of_method(
             "params.smoother.mapping_interval",
-            "spares time while driving; 0, the recipe's own, matches every scan",
+            "leaves the scans in between to the samples; 0, the recipe's own, matches every scan",
         ),
         "surroundingkeyframeAddingDistThreshold": _of_method("params.submap.keyframe_distance"),
         "surroundingkeyframeAddingAngleThreshold": _of_method("params.submap.keyframe_angle"),

@@ -23,6 +23,7 @@ from lio_jax.core.error_state import DOF as NAV_DOF
 from lio_jax.core.errors import UsageError
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan
+from lio_jax.estimation.chain import information_of, linearise
 from lio_jax.estimation.evidence import log_evidence
 from lio_jax.estimation.motion_state import DOF
 from lio_jax.estimation.sliding_window import Added, Window, append_and_update
@@ -150,8 +151,9 @@ def step(
         features = in_single_precision(lio_sam_features, config, params, scan)
         room = config.lio_sam.corner_points, config.lio_sam.surface_points
         corner, surface, thinned_away = thinned_features(features.corner, features.surface, params, *room)
-        seen = jnp.any(features.surface.mask)
         enough = (jnp.sum(corner.mask) >= _LEAST_CORNERS) & (jnp.sum(surface.mask) >= _LEAST_SURFACES)
+        # a first scan that is too poor would be a map in which nothing is ever found
+        seen = jnp.where(first, enough, jnp.any(features.surface.mask))
     with jax.named_scope("predict"):
         odometry = _as_nav(state.nav, state.window)
         # the first scan's end is the world's origin: its samples only deskew it
@@ -174,10 +176,9 @@ def step(
         due = time - state.matched_at >= params.smoother.mapping_interval - _TIME_SLACK
         lost = ((match.status == TOO_FEW_MATCHES) | ~enough) & ~first
         matched = due & ~lost & ~first
-        T_matched = match.T_world_lidar @ state.nav.T_imu_lidar.inverse()
+        T_matched = within_limits(match.T_world_lidar, params.smoother) @ state.nav.T_imu_lidar.inverse()
         attitude, _ = measured_attitude(imu, end + state.nav.time_offset, guess.rotation())
         T_matched = drawn_to_tilt(T_matched, attitude, params.smoother.tilt_weight)
-        T_matched = within_limits(T_matched, params.smoother)
         T_world_imu = jaxlie.SE3(jnp.where(matched, T_matched.wxyz_xyz, guess.wxyz_xyz))
     with jax.named_scope("smooth"):
         intervals = sample_intervals(imu, state.nav.time_offset, end - interval, end)
@@ -192,14 +193,22 @@ def step(
         )
         failed = runs_away(window.latest(), params)
         fresh = opened(config, params, _at_rest(state.nav, T_world_imu))
-        keep = first | failed
-        kept = jax.tree.map(lambda old, new: jnp.where(first, old, new), state.window, fresh)
-        window = jax.tree.map(lambda new, old: jnp.where(keep, old, new), window, kept)
+        failed = failed & ~first
+        window = jax.tree.map(
+            lambda old, new, anew: jnp.where(first, old, jnp.where(failed, anew, new)),
+            state.window,
+            window,
+            fresh,
+        )
+        # of the window that is kept, whichever it is
+        normal = linearise(window.chain, information_of(window.chain), window.states)
+        smoothed = dataclasses.replace(smoothed, states=window.states, normal=normal)
     nav = dataclasses.replace(_as_nav(state.nav, window), T_world_imu=T_world_imu)
     with jax.named_scope("keyframe"):
         # the map is a constant of the derivative
         T_world_lidar, still = jax.lax.stop_gradient((lidar_pose(nav), points))
-        keyframe = (matched | (first & seen)) & is_due(state.map.keyframes, T_world_lidar, params.submap)
+        sound = (matched & ~failed) | (first & seen)
+        keyframe = sound & is_due(state.map.keyframes, T_world_lidar, params.submap)
         submap, frames, placed, added = with_scan(
             state.map, keyframe, still, T_world_lidar, jax.lax.stop_gradient(time), params
         )
@@ -207,7 +216,7 @@ def step(
         nav=nav,
         window=window,
         time=time,
-        matched_at=jnp.where(matched | first, time, state.matched_at),
+        matched_at=jnp.where(matched, time, state.matched_at),
         scans=state.scans + seen.astype(jnp.int32),
         map=submap,
     )
@@ -231,6 +240,8 @@ def step(
         map_dropped=added[0].dropped + added[1].dropped,
         covariance=_covariance(smoothed, window),
         log_evidence=log_evidence(window.chain, smoothed),
+        corners=jnp.arange(corners + surfaces) < corners,
+        restarted=failed,
     )
 
 

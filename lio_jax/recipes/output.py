@@ -51,4 +51,6 @@ class Output(eqx.Module):
     evidence: Evidence | None = None
     """None from recipes that carry no covariance."""
     log_evidence: Float[Array, ""] | None = None
-    """Log marginal likelihood of all measurements so far; None from recipes without a smoother."""
+    """Log marginal likelihood of all measurements since the smoother began; None from recipes without one."""
+    restarted: Bool[Array, ""] | None = None
+    """The smoother ran away and began anew; None from recipes without one."""

@@ -29,18 +29,18 @@ def drawn_to_tilt(T_world_imu: jaxlie.SE3, R_world_imu: jaxlie.SO3, weight: Floa
     return jaxlie.SE3.from_rotation_and_translation(rotation, T_world_imu.translation())
 
 
-def within_limits(T_world_imu: jaxlie.SE3, params: SmootherParams) -> jaxlie.SE3:
-    """Return a pose with roll, pitch and height cut off at their limits."""
-    angles = T_world_imu.rotation().as_rpy_radians()
+def within_limits(T_world_lidar: jaxlie.SE3, params: SmootherParams) -> jaxlie.SE3:
+    """Return a pose with roll, pitch and height cut off at their limits: the lidar's, as in LIO-SAM."""
+    angles = T_world_lidar.rotation().as_rpy_radians()
     roll, pitch = (
         jnp.clip(angle, -params.tilt_limit, params.tilt_limit) for angle in (angles.roll, angles.pitch)
     )
-    position = T_world_imu.translation()
+    position = T_world_lidar.translation()
     height = jnp.clip(position[2], -params.height_limit, params.height_limit)
     level = jaxlie.SO3.from_rpy_radians(roll, pitch, angles.yaw).wxyz
-    # untouched to the last bit where nothing is cut off
-    cut = (roll != angles.roll) | (pitch != angles.pitch)
-    rotation = jaxlie.SO3(jnp.where(cut, level, T_world_imu.rotation().wxyz))
+    # untouched to the last bit where nothing is cut off, and where straight up leaves no angles
+    cut = (jnp.abs(angles.roll) > params.tilt_limit) | (jnp.abs(angles.pitch) > params.tilt_limit)
+    rotation = jaxlie.SO3(jnp.where(cut, level, T_world_lidar.rotation().wxyz))
     return jaxlie.SE3.from_rotation_and_translation(rotation, position.at[2].set(height))
 
 

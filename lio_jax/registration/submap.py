@@ -69,7 +69,7 @@ def with_scan(
         surface_mask=jnp.concatenate([placed.surface_mask & keep, entering.surface_mask]),
     )
     half_side = params.point_map.cube_side_length / 2
-    margin = params.point_map.cube_margin * params.lidar.max_range
+    margin = half_side / 2
 
     def follow(pmap: PointMap, frame: Frame, block: Float[Array, ""]) -> PointMap:
         in_blocks = (jnp.stack([half_side, margin]) / block).astype(jnp.float32)

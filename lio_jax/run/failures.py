@@ -35,6 +35,8 @@ class Evidence:
     """From the last scan's end to this one's, s; 0 for the first."""
     imu_gap_s: float | None
     """Longest time without an inertial sample since then, s; None where none are used."""
+    restarted: bool = False
+    """The smoother ran away and began anew."""
 
 
 def failure_of(now: Evidence, before: Evidence | None, settings: Settings) -> str:
@@ -50,6 +52,11 @@ def failure_of(now: Evidence, before: Evidence | None, settings: Settings) -> st
     """
     limits = settings.values["limits"]
     said = [_match_failure(now, settings)]
+    if now.restarted:
+        said.append(
+            "the smoother's velocity or biases ran beyond params.limits or were not finite; "
+            f"it began anew at rest: {_cause(now)}."
+        )
     if now.since_last_s > limits["outage"]:
         by = "constant velocity" if _gap(now) > LONGEST_GAP or now.imu_gap_s is None else "inertial samples"
         said.append(f"no scan came for {now.since_last_s:.2f} s before it: {by} predicted the motion.")
@@ -98,6 +105,9 @@ def _match_failure(now: Evidence, settings: Settings) -> str:
         )
     if found.status == ITERATION_LIMIT:
         limit = settings.config.registration.max_iterations
+        if settings.recipe == "lio_sam" and found.iterations < limit:
+            limit = settings.config.lio_sam.smoother_iterations
+            return f"the smoother did not converge in {limit} iterations; its last states were kept."
         return f"registration did not converge in {limit} iterations; its last pose was kept."
     # too few matches without being lost: the scan that starts the map
     if found.status == CONVERGED and (weak := int(found.degenerate.sum())):

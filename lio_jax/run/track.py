@@ -136,6 +136,7 @@ class Judged:
             lost=bool(output.lost),
             nis=float(output.nis),
             since_last_s=float(fed.scan.interval),
+            restarted=output.restarted is not None and bool(output.restarted),
             imu_gap_s=_imu_gap(fed.imu, fed.scan, nav) if fed.imu else None,
         )
         failure = failure_of(evidence, self._before, self._settings)

@@ -127,7 +127,8 @@ def map_consistency(seen: Observed, truth: TruePose) -> Float[Array, ""]:
 def _evidence(seen: Observed) -> Evidence:
     if seen.evidence is None:
         raise UsageError(
-            "the recipe runs without inertial samples and has no innovations; use ate, rpe or map."
+            "the recipe carries no innovations (neither a smoother does nor a run without inertial samples); "
+            "use marginal with lio_sam, else ate, rpe or map."
         )
     return seen.evidence
 

@@ -163,6 +163,17 @@ def test_points_that_are_not_finite_are_ignored(value):
     assert ate(poses) < 0.03
 
 
+def test_a_torn_first_scan_does_not_become_the_map():
+    def torn(number, scan, imu):
+        few = scan.mask & (jnp.arange(len(scan.mask)) < 300)
+        return (replace(scan, mask=few) if number == 0 else scan), imu
+
+    states, outputs, _ = run(change=torn, count=6)
+    assert [int(state.scans) for state in states] == [0, 1, 2, 3, 4, 5]
+    assert not any(output.lost for output in outputs[2:])
+    assert all(np.isfinite(np.asarray(output.covariance)).all() for output in outputs)
+
+
 def silent(imu: ImuBatch) -> ImuBatch:
     return replace(imu, mask=jnp.zeros_like(imu.mask))
 
@@ -197,13 +208,19 @@ def test_a_runaway_bias_starts_the_smoother_anew():
         wild = replace(imu, accel=imu.accel + 300.0)
         return scan, wild if number == MOVING else imu
 
-    states, _, poses = run(change=shaken)
+    states, outputs, poses = run(change=shaken)
     assert np.isfinite(poses).all()
     counts = [int(state.window.chain.count) for state in states]
     assert counts[MOVING - 1] == 4
     assert 1 in counts[MOVING:]
     assert counts[-1] == 4
     assert np.abs(np.asarray(states[-1].nav.accel_bias)).max() < 1.0
+    restarted = [bool(output.restarted) for output in outputs]
+    assert restarted.index(True) >= MOVING
+    assert not outputs[restarted.index(True)].added.any()
+    for output in outputs:
+        assert np.isfinite(np.asarray(output.covariance)).all()
+        assert np.isfinite(float(output.log_evidence))
 
 
 def test_information_in_place_of_fixed_sigmas():

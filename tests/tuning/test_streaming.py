@@ -21,15 +21,17 @@ STEPS = {"imu.gyro_bias_walk": 1e-3, "imu.accel_bias_walk": 1e-3, "extrinsics": 
 """Small where points move, lest they find another plane; large where hardly anything does."""
 NOISE = 2e-10
 """Of a total, because solves end at a step of 1e-12 and not of 0."""
-SMOOTHER_STEPS = {
-    "imu": 1e-2, "imu.gravity": 1e-5, "initial": 1e-4, "smoother": 1e-4, "extrinsics": 1e-6, "": 1e-5
-}  # fmt: skip
-SMOOTHER_NOISE = 5e-8
-"""A smoother's covariances, from information that spans sixteen orders of magnitude, keep eight digits."""
+SMOOTHER_STEPS = {**STEPS, "imu.gyro_noise": 3e-3, "imu.accel_noise": 3e-3}
+SMOOTHER_NOISE = 1e-9
+"""Information of states that spans sixteen orders of magnitude leaves fewer digits."""
 
 
 class Everything(eqx.Module):
-    """Weighs all that a scan leaves to see: trajectory, velocity, biases, covariance, innovations."""
+    """Weighs all that a scan leaves to see: trajectory, velocity, biases, a filter's covariance, innovations.
+
+    A smoother's covariance keeps eight digits, too few for differences; its derivatives and those of its
+    evidence are tested where no points are matched.
+    """
 
     def start(self):
         return jnp.zeros(())
@@ -43,13 +45,9 @@ class Everything(eqx.Module):
             seen.nav.gravity,
             seen.rmse[None],
         ]
-        if seen.covariance is not None:
-            digits = 0.01 if seen.evidence is None else 1.0
-            smooth.append(digits * jnp.log(jnp.diagonal(seen.covariance)[:15] + 1e-9))
         if seen.evidence is not None:
+            smooth.append(jnp.log(jnp.diagonal(seen.covariance)[:15] + 1e-9))
             smooth.append(-0.01 * seen.evidence.innovation.log_likelihood()[None])
-        if seen.log_evidence is not None:
-            smooth.append(-1e-3 * seen.log_evidence[None])
         values = jnp.concatenate(smooth)
         return sums + values @ jnp.sin(1.0 + jnp.arange(len(values)))
 
