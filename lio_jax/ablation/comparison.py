@@ -32,6 +32,10 @@ class Comparison:
         """Return the metric that ranks."""
         return self.spec.metrics[0]
 
+    def __str__(self) -> str:
+        """Return the ranking as an aligned table."""
+        return as_text(self)
+
 
 def compare(spec: Spec, tasks: list[Task], store: Store) -> Comparison:
     """Read the results and rank them."""

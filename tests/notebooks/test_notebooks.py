@@ -1,0 +1,74 @@
+"""Each notebook runs from a clean kernel, and lies in the repository without outputs."""
+
+import os
+import sys
+from pathlib import Path
+
+import nbformat
+import pytest
+from jupyter_client import AsyncKernelManager
+from nbclient import NotebookClient
+
+ROOT = Path(__file__).parents[2]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+PICTURES = {
+    "01_first_run": 4,
+    "02_inside_one_scan": 4,
+    "03_gradient_and_tuning": 2,
+    "04_ablation": 1,
+    "05_your_own_bag": 2,
+}
+
+
+@pytest.fixture(scope="module")
+def programs(tmp_path_factory):
+    """One cache of compiled programs for all notebooks and the commands that they run."""
+    return os.environ.get("LIO_JAX_CACHE") or str(tmp_path_factory.getbasetemp() / "programs")
+
+
+@pytest.fixture
+def kernel(tmp_path, monkeypatch, programs):
+    """What a kernel inherits: this installation's commands, no settings of the user's."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    environment = {
+        "PATH": path,
+        "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
+        "IPYTHONDIR": str(tmp_path / "ipython"),
+        "LIO_JAX_CACHE": programs,
+        "JAX_COMPILATION_CACHE_DIR": programs,
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+    }
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+
+
+def read(path: Path) -> nbformat.NotebookNode:
+    return nbformat.read(path, as_version=4)
+
+
+def test_all_notebooks_are_known():
+    assert [path.stem for path in NOTEBOOKS] == sorted(PICTURES)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_is_kept_without_outputs(path):
+    notebook = read(path)
+    nbformat.validate(notebook)
+    for cell in notebook.cells:
+        assert not cell.get("outputs")
+        assert cell.get("execution_count") is None
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs_from_a_clean_kernel(path, tmp_path, kernel):
+    """A cell that raises, or a command that fails, fails the test."""
+    notebook, folder = read(path), tmp_path / "work"
+    folder.mkdir()
+    # sockets of the file system: no port is opened
+    manager = AsyncKernelManager(kernel_name="python3", transport="ipc")
+    NotebookClient(notebook, km=manager, timeout=600, resources={"metadata": {"path": str(folder)}}).execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    pictures = [output for output in outputs if "image/png" in output.get("data", {})]
+    assert len(pictures) == PICTURES[path.stem]
+    assert not [output.text for output in outputs if "Warning" in output.get("text", "")]
