@@ -21,8 +21,8 @@ STEPS = {"imu.gyro_bias_walk": 1e-3, "imu.accel_bias_walk": 1e-3, "extrinsics": 
 """Small where points move, lest they find another plane; large where hardly anything does."""
 NOISE = 2e-10
 """Of a total, because solves end at a step of 1e-12 and not of 0."""
-SMOOTHER_STEPS = {**STEPS, "imu.gyro_noise": 3e-3, "imu.accel_noise": 3e-3}
-SMOOTHER_NOISE = 1e-9
+SMOOTHER_STEPS = {**STEPS, "imu.gyro_noise": 1e-2, "imu.accel_noise": 1e-2, "extrinsics": 1e-6}
+SMOOTHER_NOISE = 1e-8
 """Information of states that spans sixteen orders of magnitude leaves fewer digits."""
 
 
