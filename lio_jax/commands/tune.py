@@ -68,7 +68,8 @@ def tune(
         optimiser = "scoring" if named.likelihood else "lbfgsb"
     if optimiser == "scoring" and not named.likelihood:
         raise UsageError(
-            f"--optimizer scoring wants a likelihood (pose, point, planes, noise), not {options.objective}."
+            "--optimizer scoring wants a likelihood (pose, point, planes, noise, marginal), "
+            f"not {options.objective}."
         )
     base = resolve_settings(options.recipe, options.assignments, options.params_from)
     patterns = [word.strip() for word in options.params.split(",") if word.strip()]

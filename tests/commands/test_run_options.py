@@ -237,7 +237,7 @@ def test_settings_file_that_is_not_there(folder, cli, tmp_path):
 def test_unknown_recipe(folder, cli, tmp_path):
     done = cli("run", folder, "--out", tmp_path / "out", "--recipe", "fast_lio3")
     assert done.status == 2
-    assert "recipe 'fast_lio3' is not known; there are: default, fast_lio2, loam; or give" in done.err
+    assert "'fast_lio3' is not known; there are: default, fast_lio2, lio_sam, loam; or give" in done.err
 
 
 def test_progress_on_a_terminal_only(folder, tmp_path, monkeypatch):
