@@ -10,7 +10,7 @@ demo: $(VENV)/.installed
 	$(BIN)/lio-jax demo --out out/demo --overwrite
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+	$(BIN)/python -m pytest -n 4 --dist loadfile
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -1,10 +1,13 @@
 """Numerics settings and run-time shape checks shared by all tests."""
 
+import gc
 import os
+from pathlib import Path
 
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=true")
 
 import jax
+import pytest
 from jaxtyping import install_import_hook
 
 from tests import type_checker
@@ -19,3 +22,16 @@ _CHECKED = (
     "imu lidar mapping registration estimation loops recipes sim"
 )
 install_import_hook([f"lio_jax.{name}" for name in _CHECKED.split()], f"{type_checker.__name__}.checked")
+
+_MAPPINGS = Path("/proc/self/maps")
+_MOST_MAPPINGS = 40_000
+"""The kernel allows a process 65,530. Compiled programs take several each; where one finds none left, the
+process ends by a segmentation fault."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def room_for_programs():
+    """Give the room of the last modules' programs to the next one's where it runs short."""
+    if _MAPPINGS.exists() and _MAPPINGS.read_bytes().count(b"\n") > _MOST_MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
