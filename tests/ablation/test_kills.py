@@ -67,7 +67,11 @@ def test_workers_are_killed(tmp_path):
     over.set()
     killer.join()
     assert len(killed) == KILLS_OF_WORKERS
+    before = results(root)
+    trivial.run(root)
     check_all_done(root)
+    # none of those that were done is done again
+    assert {key: results(root)[key] for key in before} == before
 
 
 def test_commands_are_killed(tmp_path):

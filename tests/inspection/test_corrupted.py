@@ -103,7 +103,7 @@ def test_a_healthy_recording_gives_no_suspicion(tmp_path):
     found = inspected(tmp_path, walk())
     assert found.problems == []
     assert found.suggested_config == ["--recipe default"]
-    assert found.missing == {"default": [], "fast_lio2": [], "loam": []}
+    assert found.missing == {"default": [], "fast_lio2": [], "lio_sam": [], "loam": []}
     turns = found.turns
     assert turns is not None
     # measured: 0.998, 0.3 deg of sigma 0.8, -2 ms of sigma 2.4
