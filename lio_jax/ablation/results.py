@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import platform
 from collections.abc import Iterable, Mapping
 from importlib.metadata import version
@@ -14,6 +13,7 @@ from lio_jax.ablation.store import Store
 from lio_jax.ablation.tasks import Task, code_version
 from lio_jax.core.files import atomic_path
 from lio_jax.core.settings import Settings
+from lio_jax.run.environment import processor, usable_cores
 from lio_jax.run.folder import write_json
 
 if TYPE_CHECKING:
@@ -120,18 +120,10 @@ def _manifest(task: Task, settings: Settings, metrics: Mapping[str, Any], batch:
         },
         "hardware": {
             "machine": platform.machine(),
-            "processor": _processor(),
-            "cores": len(os.sched_getaffinity(0)),
+            "processor": processor(),
+            "cores": usable_cores(),
             "devices": [device.device_kind for device in devices],
         },
         "timings": {name: metrics.get(name) for name in ("compile_s", "wall_s", "scan_ms")},
         "batch": batch,
     }
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")

@@ -17,8 +17,8 @@ def environment() -> dict[str, str]:
         **{name: _version(name) for name in _LIBRARIES},
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
-        "processor": _processor(),
-        "cores": str(_cores()),
+        "processor": processor(),
+        "cores": str(usable_cores()),
         "devices": ", ".join(devices),
         "double precision": "on" if jax.config.read("jax_enable_x64") else "off",
     }
@@ -31,12 +31,13 @@ def _version(name: str) -> str:
         return "not installed"
 
 
-def _cores() -> int:
-    """Return how many the process may use."""
+def usable_cores() -> int:
+    """Return how many cores the process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _processor() -> str:
+def processor() -> str:
+    """Return the processor's name."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
