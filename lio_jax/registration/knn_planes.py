@@ -135,6 +135,15 @@ def spread(
     return (cx, cy, cz), (qx, qy, qz), moments
 
 
+def match_score(
+    distance: Float[Array, " k"], range_squared: Float[Array, " k"], knn: KnnParams
+) -> Float[Array, " k"]:
+    """Return 1 - w d / sqrt(r) of points at ranges r and distances d from their planes, m (w: ``knn``'s)."""
+    return (
+        1 - knn.distance_weight.astype(distance.dtype) * distance / jnp.maximum(range_squared, 1e-6) ** 0.25
+    )
+
+
 def linearise(
     planes: Planes,
     points: Float[Array, "k 3"],
@@ -155,8 +164,7 @@ def linearise(
     )
     distance = nx * px + ny * py + nz * pz + planes.offset
     range_squared = rx**2 + ry**2 + rz**2
-    weight = knn.distance_weight.astype(kind)
-    score = 1 - weight * jnp.abs(distance) / jnp.maximum(range_squared, 1e-6) ** 0.25
+    score = match_score(jnp.abs(distance), range_squared, knn)
     used = planes.valid & (score > knn.min_score.astype(kind))
     counts = used.astype(kind)
     distance = jnp.where(used, distance, 0.0)

@@ -17,7 +17,7 @@ from lio_jax.core.materialise import materialised
 from lio_jax.core.params import KnnParams
 from lio_jax.mapping.point_map import PointMap
 from lio_jax.registration.gauss_newton import NormalEquations
-from lio_jax.registration.knn_planes import Planes, neighbours_within, no_planes, spread
+from lio_jax.registration.knn_planes import Planes, match_score, neighbours_within, no_planes, spread
 from lio_jax.registration.scan_to_map import Frame
 
 _Coordinates = Float32[Array, "n k"]
@@ -157,16 +157,16 @@ def scored(knn: KnnParams) -> Weights:
     multiplies distance and derivative.
     """
 
-    def weight(squared_distance: Float[Array, " k"], scale: Float[Array, " k"] | float) -> Float[Array, " k"]:
-        dtype = squared_distance.dtype
+    def distance(squared: Float[Array, " k"]) -> Float[Array, " k"]:
         # the square root's slope is infinite at 0
-        distance = jnp.sqrt(jnp.maximum(squared_distance, 1e-12))
-        score = 1 - knn.distance_weight.astype(dtype) * distance / scale
-        return jnp.where(score > knn.min_score.astype(dtype), score**2, 0.0)
+        return jnp.sqrt(jnp.maximum(squared, 1e-12))
+
+    def weight(score: Float[Array, " k"]) -> Float[Array, " k"]:
+        return jnp.where(score > knn.min_score.astype(score.dtype), score**2, 0.0)
 
     return Weights(
-        lambda squared, _: weight(squared, 1.0),
-        lambda squared, range_squared: weight(squared, jnp.maximum(range_squared, 1e-6) ** 0.25),
+        lambda squared, _: weight(1 - knn.distance_weight.astype(squared.dtype) * distance(squared)),
+        lambda squared, range_squared: weight(match_score(distance(squared), range_squared, knn)),
     )
 
 
