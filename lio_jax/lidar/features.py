@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.config import Config
+from lio_jax.core.errors import UsageError
 from lio_jax.core.materialise import materialised
 from lio_jax.core.params import Params
 from lio_jax.core.types import Scan
@@ -73,6 +74,20 @@ class Rings(eqx.Module):
     ring: Ring
     bounds: Int32[Array, "bounds rings"]
     """Of the sectors."""
+
+
+def check_sizes(config: Config) -> None:
+    """Refuse sizes of ``config.features`` that are still to be chosen by the recording.
+
+    Raises:
+        UsageError: one of them is 0.
+    """
+    features = config.features
+    if not (features.rings and features.columns and features.surface_points):
+        raise UsageError(
+            "config.features.rings, columns and surface_points are 0, for by the recording; "
+            "take the settings from settings_for(sequence, settings), or set them."
+        )
 
 
 def loam_features(config: Config, params: Params, scan: Scan) -> LoamFeatures:

@@ -11,8 +11,9 @@ RECIPES: dict[str, ModuleType] = {
     "lio_sam": lio_sam,
     "loam": loam,
 }
-"""By name; each module has State, Output, init(config, params, imu), step(config, params, state, scan, imu),
-restart(config, params, state, imu) and moving_as(fresh, found), what a restart adds to init."""
+"""By name; each module has State, Output, init(config, params, imu), step(config, params, state, scan, imu)
+and moving_as(fresh, found), which gives a first state the motion of a later one: a vehicle that is already
+moving distorts its first scan, which nothing can compensate until the second."""
 
 
 def recipe_named(name: str) -> ModuleType:

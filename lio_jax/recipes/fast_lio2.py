@@ -76,14 +76,6 @@ def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
     return State(start.nav, start, none, none[0], jnp.int32(0), empty_map(config.map.capacity))
 
 
-def restart(config: Config, params: Params, state: State, imu: ImuBatch | None = None) -> State:
-    """Return the state before the first scan once more, now with the velocity that ``state`` found.
-
-    A vehicle that is already moving distorts its first scan, which nothing can compensate until the second.
-    """
-    return moving_as(init(config, params, imu), state)
-
-
 def moving_as(fresh: State, found: State) -> State:
     """Return the state before the first scan with the motion of another: a mere exchange of leaves."""
     return eqx.tree_at(_motion, fresh, _motion(found))

@@ -17,11 +17,10 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.config import Config
-from lio_jax.core.errors import UsageError
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan, initial_nav_state
 from lio_jax.lidar.deskew import deskew_constant_velocity
-from lio_jax.lidar.features import FeatureCloud, LoamFeatures, loam_features
+from lio_jax.lidar.features import FeatureCloud, LoamFeatures, check_sizes, loam_features
 from lio_jax.lidar.thinned_features import in_single_precision, thinned_features
 from lio_jax.recipes.output import Output
 from lio_jax.registration.cube_map import ScanToCubes, added_to
@@ -67,11 +66,7 @@ def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
         imu: not used.
     """
     features = config.features
-    if not (features.rings and features.columns and features.surface_points):
-        raise UsageError(
-            "config.features.rings, columns and surface_points are 0, for by the recording; "
-            "take the settings from settings_for(sequence, settings), or set them."
-        )
+    check_sizes(config)
     nav = initial_nav_state(params.extrinsics.T_imu_lidar())
     dtype = nav.velocity.dtype
     start = nav.T_world_imu @ nav.T_imu_lidar
@@ -88,14 +83,6 @@ def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
             empty_scan(corners, features.surface_points, features.rings),
         ),
     )
-
-
-def restart(config: Config, params: Params, state: State, imu: ImuBatch | None = None) -> State:
-    """Return the state before the first scan once more, now with the velocity that ``state`` found.
-
-    A vehicle that is already moving distorts its first scan, which nothing can compensate until the second.
-    """
-    return moving_as(init(config, params, imu), state)
 
 
 def moving_as(fresh: State, found: State) -> State:

@@ -66,7 +66,7 @@ class CheckpointedGradient:
             if kind == "init":
                 return module.init(config, free(x), imu), None
             if kind == "restart":
-                return module.restart(config, free(x), state, imu), None
+                return module.moving_as(module.init(config, free(x), imu), state), None
             state, output = module.step(config, free(x), state, scan, imu)
             return state, Observed.of(state, output)
 

@@ -51,7 +51,6 @@ CONFIG = with_overrides(recipe_settings("fast_lio2"), SMALL).config
 STEP = jax.jit(partial(fast_lio2.step, CONFIG))
 """Two programs for all tests: with inertial samples and without."""
 INIT = jax.jit(partial(fast_lio2.init, CONFIG))
-RESTART = jax.jit(partial(fast_lio2.restart, CONFIG))
 
 
 @cache
@@ -205,11 +204,11 @@ def test_one_map_point_per_voxel_and_the_map_is_of_the_street(drive):
 
 def test_a_restart_keeps_the_velocity_and_begins_anew(without, drive):
     for (states, _, _), inertial in ((without, False), (drive, True)):
-        state = RESTART(settings_with().params(), states[-1], arrays(inertial)[1])
+        state = fast_lio2.moving_as(INIT(settings_with().params(), arrays(inertial)[1]), states[-1])
         assert state.scans == 0
         np.testing.assert_allclose(state.nav.T_world_imu.translation(), 0)
         assert not np.isfinite(np.asarray(state.map.off_centre)).any()
-    again = RESTART(settings_with().params(), without[0][-1], None)
+    again = fast_lio2.moving_as(INIT(settings_with().params(), None), without[0][-1])
     np.testing.assert_allclose(again.nav.velocity, without[0][-1].nav.velocity)
 
 

@@ -257,7 +257,7 @@ def test_a_recipe_without_sizes_says_where_they_come_from():
 
 def test_a_restart_keeps_the_velocity_and_begins_anew(drive):
     states, _, _ = drive
-    fresh = jax.jit(partial(lio_sam.restart, CONFIG))(PARAMS, states[-1], arrays()[1])
+    fresh = lio_sam.moving_as(INIT(PARAMS, arrays()[1]), states[-1])
     velocity = states[-1].nav.velocity
     np.testing.assert_array_equal(fresh.nav.velocity, velocity)
     np.testing.assert_array_equal(fresh.window.latest().velocity, velocity)

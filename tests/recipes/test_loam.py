@@ -220,7 +220,7 @@ def test_a_recipe_without_sizes_says_where_they_come_from():
 
 
 def test_a_restart_keeps_the_velocity_and_begins_anew(drive):
-    state = loam.restart(CONFIG, PARAMS, drive[0][-1])
+    state = loam.moving_as(loam.init(CONFIG, PARAMS), drive[0][-1])
     assert state.scans == 0
     np.testing.assert_array_equal(state.twist, drive[0][-1].twist)
     assert not np.isfinite(np.asarray(state.map.cubes.surface.off_centre)).any()
