@@ -32,7 +32,7 @@ from lio_jax.imu.path import Path, deskew_along
 from lio_jax.imu.preintegration import preintegrate_parallel
 from lio_jax.imu.sampling import sample_intervals
 from lio_jax.imu.strapdown import path_along
-from lio_jax.lidar.features import FeatureCloud, lio_sam_features
+from lio_jax.lidar.features import FeatureCloud, check_sizes, lio_sam_features
 from lio_jax.lidar.thinned_features import in_single_precision, thinned_features
 from lio_jax.mapping.keyframes import is_due, no_keyframes
 from lio_jax.recipes.inertial_filter import levelled_start, lidar_pose
@@ -76,17 +76,13 @@ def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
     Raises:
         UsageError: there are no inertial data.
     """
-    features, own = config.features, config.lio_sam
+    own = config.lio_sam
     if imu is None:
         raise UsageError(
             "the recipe lio_sam needs inertial samples, and there are none (or config.imu.use is false); "
             "take loam, or default."
         )
-    if not (features.rings and features.columns and features.surface_points):
-        raise UsageError(
-            "config.features.rings, columns and surface_points are 0, for by the recording; "
-            "take the settings from settings_for(sequence, settings), or set them."
-        )
+    check_sizes(config)
     nav = levelled_start(params, imu).nav
     attitude, there = measured_attitude(imu, jnp.max(imu.time), nav.T_world_imu.rotation())
     if not config.imu.heading:
@@ -105,14 +101,6 @@ def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
         scans=jnp.int32(0),
         map=Submap(keyframes, empty_feature_map(config.map.capacity)),
     )
-
-
-def restart(config: Config, params: Params, state: State, imu: ImuBatch | None = None) -> State:
-    """Return the state before the first scan once more, now with the velocity that ``state`` found.
-
-    A vehicle that is already moving distorts its first scan, which nothing can compensate until the second.
-    """
-    return moving_as(init(config, params, imu), state)
 
 
 def moving_as(fresh: State, found: State) -> State:
@@ -201,7 +189,13 @@ def step(
             fresh,
         )
         # of the window that is kept, whichever it is
-        normal = linearise(window.chain, information_of(window.chain), window.states)
+        normal = jax.lax.cond(
+            first | failed,
+            lambda kept, _: linearise(kept.chain, information_of(kept.chain), kept.states),
+            lambda _, normal: normal,
+            window,
+            smoothed.normal,
+        )
         smoothed = dataclasses.replace(smoothed, states=window.states, normal=normal)
     nav = dataclasses.replace(_as_nav(state.nav, window), T_world_imu=T_world_imu)
     with jax.named_scope("keyframe"):
