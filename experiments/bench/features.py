@@ -77,7 +77,8 @@ def _programs(scan: "LidarScan", sizes: tuple[int, int, int]) -> dict[str, dict[
     import jax.numpy as jnp
 
     from lio_jax.core.config import Config, FeaturesConfig
-    from lio_jax.core.params import DEFAULTS, params_from_values
+    from lio_jax.core.param_values import DEFAULTS
+    from lio_jax.core.params import params_from_values
     from lio_jax.lidar.features import lio_sam_features, lio_sam_rings, loam_features, loam_rings
     from lio_jax.lidar.range_image import range_image
     from lio_jax.run.feed import padded

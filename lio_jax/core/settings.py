@@ -21,7 +21,8 @@ import yaml
 
 from lio_jax.core.config import Config, invalid_config
 from lio_jax.core.errors import UsageError
-from lio_jax.core.params import DEFAULTS, Params, invalid_value, params_from_values
+from lio_jax.core.param_values import DEFAULTS, invalid_value
+from lio_jax.core.params import Params, params_from_values
 from lio_jax.core.recipe_values import RECIPE_VALUES
 
 

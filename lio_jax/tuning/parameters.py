@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.params import DEFAULTS, DIFFERENTIABLE, Params
+from lio_jax.core.param_values import DEFAULTS, DIFFERENTIABLE
+from lio_jax.core.params import Params
 
 _ROTATION = "extrinsics.rotation"
 _ADDED = ("extrinsics.translation", "extrinsics.time_offset")

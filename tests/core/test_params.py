@@ -9,14 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.params import (
-    DEFAULTS,
-    Params,
-    default_params,
-    invalid_value,
-    params_from_values,
-    values_from_params,
-)
+from lio_jax.core.param_values import DEFAULTS, invalid_value
+from lio_jax.core.params import Params, default_params, params_from_values, values_from_params
 
 PATHS = [f"{section}.{name}" for section, leaves in DEFAULTS.items() for name in leaves]
 

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.core.config import Config
 from lio_jax.core.errors import UsageError
-from lio_jax.core.params import DEFAULTS, values_from_params
+from lio_jax.core.param_values import DEFAULTS
+from lio_jax.core.params import values_from_params
 from lio_jax.core.settings import (
     Settings,
     load_settings,

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lio_jax.core.config import Config, DataConfig, FeaturesConfig, LidarConfig
-from lio_jax.core.params import DEFAULTS, Params, params_from_values
+from lio_jax.core.param_values import DEFAULTS
+from lio_jax.core.params import Params, params_from_values
 from lio_jax.core.types import Scan
 from lio_jax.data.open import open_sequence
 from lio_jax.data.sequence import LidarScan

@@ -10,7 +10,8 @@ import numpy as np
 from scipy.linalg import expm
 
 from lio_jax.core.config import Config, LidarConfig, MapConfig
-from lio_jax.core.params import DEFAULTS, Params, params_from_values
+from lio_jax.core.param_values import DEFAULTS
+from lio_jax.core.params import Params, params_from_values
 from lio_jax.core.types import Scan
 from lio_jax.recipes import default
 from lio_jax.recipes.default import State

@@ -12,7 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.error_state import EXTRINSIC_ROTATION, GYRO_BIAS, POSITION
-from lio_jax.core.params import DEFAULTS, Params
+from lio_jax.core.param_values import DEFAULTS
+from lio_jax.core.params import Params
 from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.recipes import fast_lio2, recipe_named
 from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.core.error_state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
 from lio_jax.core.errors import UsageError
-from lio_jax.core.params import DEFAULTS, Params
+from lio_jax.core.param_values import DEFAULTS
+from lio_jax.core.params import Params
 from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.core.types import ImuBatch
 from lio_jax.recipes import lio_sam, recipe_named

@@ -13,7 +13,8 @@ import pytest
 
 from lio_jax.core.config import Config
 from lio_jax.core.errors import UsageError
-from lio_jax.core.params import DEFAULTS, Params
+from lio_jax.core.param_values import DEFAULTS
+from lio_jax.core.params import Params
 from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.recipes import loam, recipe_named
 from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.params import DEFAULTS, default_params
+from lio_jax.core.param_values import DEFAULTS
+from lio_jax.core.params import default_params
 from lio_jax.core.types import state_dtype
 from lio_jax.recipes import default
 from tests.recipes.drive import (

@@ -6,7 +6,7 @@ from functools import cache
 import jax.numpy as jnp
 import numpy as np
 
-from lio_jax.core.params import DEFAULTS
+from lio_jax.core.param_values import DEFAULTS
 from lio_jax.core.settings import Settings, recipe_settings, with_overrides
 from lio_jax.run.run import settings_for
 from lio_jax.run.track import Fed

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.params import DIFFERENTIABLE
+from lio_jax.core.param_values import DIFFERENTIABLE
 from lio_jax.core.settings import recipe_settings
 from lio_jax.recipes import RECIPES
 from lio_jax.run.track import CompiledStep, stepped
