@@ -170,6 +170,16 @@ class LioSamConfig:
 
 
 @dataclass(frozen=True)
+class BackendConfig:
+    """What corrects the odometry's drift, beside any recipe."""
+
+    loops: bool = False
+    """Recognise places seen before and close loops."""
+    gps: bool = False
+    """Tie the trajectory to the recording's GPS fixes."""
+
+
+@dataclass(frozen=True)
 class OutputConfig:
     """Which of the optional files a run folder gets."""
 
@@ -201,6 +211,7 @@ class Config:
     fast_lio2: FastLio2Config = field(default_factory=FastLio2Config)
     loam: LoamConfig = field(default_factory=LoamConfig)
     lio_sam: LioSamConfig = field(default_factory=LioSamConfig)
+    backend: BackendConfig = field(default_factory=BackendConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
 
 
