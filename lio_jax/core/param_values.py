@@ -91,6 +91,11 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     },
     "motion": {"initial_error": 2.0, "error_decay": 0.5},
     "limits": {"speed": 30.0, "gyro_bias": 1.0, "accel_bias": 1.0, "outage": 1.0},
+    "backend": {
+        "odometry_rotation_sigma": 1e-3,
+        "odometry_translation_sigma": 1e-2,
+        "tilt_sigma": 0.1,
+    },
     "extrinsics": {"rotation": [0.0, 0.0, 0.0, 1.0], "translation": [0.0, 0.0, 0.0], "time_offset": 0.0},
 }
 """Values of the default recipe in the units of the leaves above."""

@@ -247,6 +247,17 @@ class LimitParams(eqx.Module):
     """Time between two scans, s."""
 
 
+class BackendParams(eqx.Module):
+    """What the back end believes of the odometry."""
+
+    odometry_rotation_sigma: Scalar
+    """Of the turn from one keyframe to the next, rad."""
+    odometry_translation_sigma: Scalar
+    """Of the way between them, m."""
+    tilt_sigma: Scalar
+    """Of the first keyframe's roll and pitch, rad, where GPS ties the trajectory to the world."""
+
+
 class ExtrinsicsParams(eqx.Module):
     """T_imu_lidar."""
 
@@ -281,6 +292,7 @@ class Params(eqx.Module):
     smoother: SmootherParams
     motion: MotionParams
     limits: LimitParams
+    backend: BackendParams
     extrinsics: ExtrinsicsParams
 
 

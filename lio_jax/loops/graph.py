@@ -53,6 +53,8 @@ class Solution(eqx.Module):
     """Half the weighted sum of squared whitened residuals."""
     weights: Float[Array, " e"]
     """Of each edge's information: 1, or below where a robust solve distrusts an edge."""
+    edge_costs: Float[Array, " e"]
+    """r' Omega r / 2 of each edge, whatever its weight."""
     initial_cost: Float[Array, ""]
     """Cost of the graph's own poses, all edges trusted."""
     iterations: int = eqx.field(static=True)

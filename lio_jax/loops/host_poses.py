@@ -34,6 +34,16 @@ def translations(poses: Poses) -> _Array:
     return numbers_of(poses)[:, 4 if isinstance(poses, jaxlie.SE3) else 2 :]
 
 
+def matrices_of(poses: Poses) -> _Array:
+    """Return (n, 4, 4), in the plane (n, 3, 3)."""
+    translation = translations(poses)
+    size = translation.shape[-1]
+    matrices = np.tile(np.eye(size + 1), (len(translation), 1, 1))
+    matrices[:, :size, :size] = rotation_matrices(poses)
+    matrices[:, :size, size] = translation
+    return matrices
+
+
 def poses_from(rotation: _Array, translation: _Array) -> Poses:
     """Return the poses of rotation matrices, (n, 3, 3) or (n, 2, 2), and translations."""
     if translation.shape[-1] == 2:

@@ -84,6 +84,7 @@ def _solve(
         poses=_unpadded(descent.point.poses, len(structure.held)),
         cost=descent.point.cost,
         weights=jax.device_put(weights),
+        edge_costs=jax.device_put(np.asarray(descent.point.edge_costs)[: len(weights)]),
         initial_cost=own.cost,
         iterations=descent.iterations,
         status=descent.status,
