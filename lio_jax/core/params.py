@@ -13,10 +13,9 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
+from lio_jax.core.backend_params import GpsParams
 from lio_jax.core.param_values import DEFAULTS
-from lio_jax.core.types import state_dtype
-
-Scalar = Float[Array, ""]
+from lio_jax.core.types import Scalar, state_dtype
 
 
 class ImuParams(eqx.Module):
@@ -281,6 +280,7 @@ class Params(eqx.Module):
     smoother: SmootherParams
     motion: MotionParams
     limits: LimitParams
+    gps: GpsParams
     extrinsics: ExtrinsicsParams
 
 
