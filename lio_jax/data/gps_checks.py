@@ -67,7 +67,7 @@ def with_covariances(covariance: NDArray[np.float64]) -> tuple[NDArray[np.float6
     Args:
         covariance: (n, 3, 3) m^2, east north up.
     """
-    finite = np.isfinite(covariance).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
     own = np.where(finite[:, None, None], covariance, 0.0)
     turned = own.transpose(0, 2, 1)
     skewed = np.abs(own - turned).max(axis=(1, 2), initial=0.0)
