@@ -217,6 +217,28 @@ def export(
     command(data, to, out, set_, layout, start, scans, overwrite)
 
 
+@app.command(name="map")
+def map_(
+    folder: Positional[Annotated[Path, arg(metavar="DIR")]],
+    out: Annotated[Path, arg(metavar="FILE")],
+    voxel: Annotated[float, arg(metavar="SIZE")] = 0.2,
+    part: Literal["whole", "corner", "surface"] = "whole",
+    overwrite: Overwrite = False,
+) -> None:
+    """Save the map of a run at any resolution, as PCD or PLY.
+
+    Args:
+        folder: Folder that lio-jax run wrote.
+        out: What to write: *.pcd or *.ply.
+        voxel: One point is kept per cube of this edge, m.
+        part: All points, or corners or surfaces alone, where the recipe tells them apart.
+        overwrite: Replace the file that is there.
+    """
+    from lio_jax.commands.map import make_map
+
+    make_map(folder, out, voxel, part, overwrite)
+
+
 @app.command(name="tune")
 def tune(
     data: Positional[Annotated[tuple[Path, ...], arg(metavar="DATA [DATA ...]")]],

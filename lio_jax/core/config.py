@@ -177,6 +177,8 @@ class BackendConfig:
     """Recognise places seen before and close loops."""
     gps: bool = False
     """Tie the trajectory to the recording's GPS fixes."""
+    gps_elevation: bool = True
+    """Use their height too; false: the odometry's stands."""
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,20 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "odometry_translation_sigma": 1e-2,
         "tilt_sigma": 0.1,
     },
+    "gps": {
+        "lever_arm": [0.0, 0.0, 0.0],
+        "min_travel": 5.0,
+        "pose_variance": 0.0,
+        "time_gap": 0.2,
+        "interpolation": 2.0,
+        "max_variance": 400.0,
+        "min_variance": 1.0,
+        "height_variance": 0.01,
+        "spacing": 5.0,
+        "jump_sigmas": 4.0,
+        "drift": 0.05,
+        "yaw_sigma": 0.1,
+    },
     "extrinsics": {"rotation": [0.0, 0.0, 0.0, 1.0], "translation": [0.0, 0.0, 0.0], "time_offset": 0.0},
 }
 """Values of the default recipe in the units of the leaves above."""
@@ -112,7 +126,7 @@ DIFFERENTIABLE = (
 )
 """Leaves with a derivative. The others choose: which points, which voxels, when to stop, what to report."""
 
-_ANY_SIGN = {"extrinsics.translation", "extrinsics.time_offset"}
+_ANY_SIGN = {"extrinsics.translation", "extrinsics.time_offset", "gps.lever_arm"}
 _MAY_BE_ZERO = {
     *(f"initial.{name}" for name in DEFAULTS["initial"]),
     "lidar.min_range",
@@ -130,6 +144,11 @@ _MAY_BE_ZERO = {
     "registration.degeneracy_ratio",
     "registration.inertial_degeneracy_ratio",
     "motion.error_decay",
+    "gps.min_travel",
+    "gps.pose_variance",
+    "gps.interpolation",
+    "gps.spacing",
+    "gps.drift",
 }
 _AT_MOST_ONE = {
     "knn.min_score",

@@ -13,10 +13,9 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
+from lio_jax.core.backend_params import BackendParams, GpsParams
 from lio_jax.core.param_values import DEFAULTS
-from lio_jax.core.types import state_dtype
-
-Scalar = Float[Array, ""]
+from lio_jax.core.types import Scalar, state_dtype
 
 
 class ImuParams(eqx.Module):
@@ -247,17 +246,6 @@ class LimitParams(eqx.Module):
     """Time between two scans, s."""
 
 
-class BackendParams(eqx.Module):
-    """What the back end believes of the odometry."""
-
-    odometry_rotation_sigma: Scalar
-    """Of the turn from one keyframe to the next, rad."""
-    odometry_translation_sigma: Scalar
-    """Of the way between them, m."""
-    tilt_sigma: Scalar
-    """Of the first keyframe's roll and pitch, rad, where GPS ties the trajectory to the world."""
-
-
 class ExtrinsicsParams(eqx.Module):
     """T_imu_lidar."""
 
@@ -293,6 +281,7 @@ class Params(eqx.Module):
     motion: MotionParams
     limits: LimitParams
     backend: BackendParams
+    gps: GpsParams
     extrinsics: ExtrinsicsParams
 
 

@@ -99,6 +99,9 @@ RECIPE_VALUES: dict[str, dict[str, Any]] = {
         "params.knn.radius": 1.0,
         "params.knn.plane_tolerance": 0.2,
         "params.knn.min_score": 0.1,
+        "config.backend.gps_elevation": False,
+        "params.gps.pose_variance": 25.0,
+        "params.gps.max_variance": 2.0,
         # keyframes within 50 m see farther than that
         "params.point_map.cube_side_length": 400.0,
     },

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
+Scalar = Float[Array, ""]
+
 
 class Scan(eqx.Module):
     """One LiDAR sweep, padded to a bucket size n."""

@@ -3,15 +3,17 @@
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lio_jax.data.enu import geodetic_to_enu
+from lio_jax.data.enu import geodetic_to_ecef, geodetic_to_enu
+from lio_jax.data.gps_checks import with_covariances
 from lio_jax.data.sequence import GpsData
 
 FIX_TYPE = "sensor_msgs/msg/NavSatFix"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 
-_UNSTATED_SIGMA = (5.0, 5.0, 10.0)
-"""m, east north up: of a plain receiver, where the messages state no covariance."""
+_FARTHEST_M = 200e3
+"""Fixes farther than this from the middle one are no part of a drive: a receiver's place before it knew."""
 
 
 class GpsCollector:
@@ -52,18 +54,29 @@ class GpsCollector:
             notes.append(f"GPS: {self._skipped} messages without a valid fix were left out")
         if not self._stamps:
             return None, tuple(notes)
-        stamps, order = np.unique(np.array(self._stamps, np.int64), return_index=True)
-        positions = np.array(self._positions)
-        covariances = np.array(self._covariances)[order]
-        unstated = ~(np.diagonal(covariances, axis1=1, axis2=2) > 0).all(axis=1)
-        if unstated.any():
-            covariances[unstated] = np.diag(np.square(_UNSTATED_SIGMA))
-            notes.append(
-                f"GPS: {np.count_nonzero(unstated)} of {len(stamps)} fixes state no covariance: "
-                "5 m horizontally and 10 m vertically were assumed"
-            )
+        stamps, positions = np.array(self._stamps, np.int64), np.array(self._positions)
+        covariances = np.array(self._covariances)
         origin = (float("nan"),) * 3
         if self._geodetic:
-            origin = self._positions[0]
+            here = _in_one_region(positions)
+            if not here.all():
+                notes.append(
+                    f"GPS: {np.sum(~here)} fixes more than {_FARTHEST_M / 1e3:g} km from the others were "
+                    "left out"
+                )
+            stamps, positions, covariances = stamps[here], positions[here], covariances[here]
+            origin = tuple(positions[0].tolist())
             positions = geodetic_to_enu(positions, origin)
+        if back := int(np.sum(np.diff(stamps) < 0)):
+            notes.append(f"GPS: stamps step back {back} time(s); the fixes were put in order by their stamps")
+        stamps, order = np.unique(stamps, return_index=True)
+        covariances, unstated = with_covariances(covariances[order])
+        if unstated:
+            notes.append(f"GPS: {unstated}")
         return GpsData(stamps, positions[order], covariances, origin), tuple(notes)
+
+
+def _in_one_region(geodetic: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return (n,) whether fixes are near the middle one, whose tangent plane is level for them."""
+    places = geodetic_to_ecef(geodetic)
+    return np.asarray(np.linalg.norm(places - np.median(places, axis=0), axis=1) < _FARTHEST_M)

@@ -28,7 +28,7 @@ _FROM_NAVSAT = "odometry/gps"
 
 _OUTPUT = "names or draws what its nodes publish; a run writes a folder"
 _NO_LOOPS = "a run closes no loops"
-_NO_GPS = "a run does not use GPS"
+_WITH_GPS = "counts where fixes are used: config.backend.gps=true"
 
 
 def _extrinsic_rot(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
@@ -96,7 +96,9 @@ LIO_SAM = System(
             ("odomTopic", "lidarFrame", "baselinkFrame", "odometryFrame", "mapFrame"), nothing(_OUTPUT)
         ),
         "useImuHeadingInitialization": _of_method("config.imu.heading"),
-        **dict.fromkeys(("useGpsElevation", "gpsCovThreshold", "poseCovThreshold"), nothing(_NO_GPS)),
+        "useGpsElevation": _of_method("config.backend.gps_elevation", _WITH_GPS),
+        "gpsCovThreshold": _of_method("params.gps.max_variance", _WITH_GPS),
+        "poseCovThreshold": _of_method("params.gps.pose_variance", _WITH_GPS),
         "savePCD": nothing("map.pcd is written unless config.output.map=false"),
         "savePCDDirectory": nothing("map.pcd lies in the run's folder"),
         "sensor": Rule(_sensor, method=True),

@@ -45,10 +45,13 @@ def chordal_poses(graph: PoseGraph, structure: Structure, weights: _Array | None
     R, t = _relative_poses(without, among_themselves, weights[others])
     loose = among_themselves.held & ~structure.held
     fixes = translations(graph.measurement)
+    lever = np.zeros_like(fixes) if graph.lever is None else np.asarray(graph.lever)
     for part in structure.part[loose]:
         here = positions[structure.part[structure.j[positions]] == part]
         own = structure.part == part
-        turn, shift = _laid_onto(t[structure.j[here]], fixes[here], weights[here])
+        j = structure.j[here]
+        antennas = t[j] + np.einsum("eij,ej->ei", R[j], lever[here])
+        turn, shift = _laid_onto(antennas, fixes[here], weights[here])
         R[own], t[own] = turn @ R[own], t[own] @ turn.T + shift
     return _with_held(graph, structure, R, t)
 
@@ -74,6 +77,7 @@ def edges_at(graph: PoseGraph, index: NDArray[np.int64]) -> PoseGraph:
         chosen(graph.information),
         chosen(graph.kind),
         graph.fixed,
+        None if graph.lever is None else chosen(graph.lever),
     )
 
 

@@ -31,7 +31,7 @@ class Linearised(NamedTuple):
 
 
 def residuals(T_world_i: Poses, T_world_j: Poses, graph: PoseGraph) -> Float[Array, "e d"]:
-    """Return Log(Z^-1 T_i^-1 T_j) of each edge, Log(Z^-1 T_j) of a prior, (0, t_j - z) of a position.
+    """Return Log(Z^-1 T_i^-1 T_j) of each edge, Log(Z^-1 T_j) of a prior, (0, T_j l - z) of a position.
 
     Args:
         T_world_i: (e,) poses of the edges' first vertices.
@@ -51,19 +51,14 @@ def linearise(poses: Poses, graph: PoseGraph) -> Linearised:
     """Return cost, gradient and Gauss-Newton Hessian of each edge, in closed form.
 
     With E = Z^-1 T_i^-1 T_j perturbations move it by E exp(d_j - Ad(T_j^-1 T_i) d_i), and Log(E exp(d)) by
-    J_r^-1 d.
+    J_r^-1 d. A position's lever l moves by R_j (v + w x l) for d = (w, v).
     """
     T_world_i, T_world_j = picked(poses, graph.i), picked(poses, graph.j)
     missed = _missed(T_world_i, T_world_j, graph)
     r = _residual(missed, T_world_j, graph)
     A_j = right_jacobian_inverse(r)
     across = rotation_first((T_world_j.inverse() @ T_world_i).adjoint(), axes=2)
-    size = r.shape[-1]
-    rotates = 3 if size == 6 else 1
-    R = T_world_j.rotation().as_matrix()
-    turned = jnp.zeros((*r.shape, size), r.dtype).at[:, rotates:, rotates:].set(R)
-    is_position = (graph.kind == POSITION)[:, None, None]
-    A_j = jnp.where(is_position, turned, A_j)
+    A_j = jnp.where((graph.kind == POSITION)[:, None, None], _position_slope(T_world_j, graph), A_j)
     A_i = jnp.where(_is_unary(graph)[:, None, None], 0.0, -_product(A_j, across))
     weighted_i, weighted_j = _product(graph.information, A_i), _product(graph.information, A_j)
     weighted_r = jnp.einsum("eij,ej->ei", graph.information, r)
@@ -110,10 +105,31 @@ def _missed(T_world_i: Poses, T_world_j: Poses, graph: PoseGraph) -> Poses:
 
 
 def _residual(missed: Poses, T_world_j: Poses, graph: PoseGraph) -> Float[Array, "e d"]:
-    off = T_world_j.translation() - graph.measurement.translation()
+    point = T_world_j.translation()
+    if graph.lever is not None:
+        point = point + _rotated(T_world_j, graph.lever)
+    off = point - graph.measurement.translation()
     rotates = missed.tangent_dim - off.shape[-1]
     position = jnp.pad(off, ((0, 0), (rotates, 0)))
     return jnp.where((graph.kind == POSITION)[:, None], position, rotation_first(missed.log()))
+
+
+def _position_slope(T_world_j: Poses, graph: PoseGraph) -> Float[Array, "e d d"]:
+    """Return the derivative of (0, T_j exp(d) l - z) at d = 0."""
+    R = T_world_j.rotation().as_matrix()
+    size, dimensions = T_world_j.tangent_dim, R.shape[-1]
+    by_shift = jnp.pad(R, ((0, 0), (size - dimensions, 0), (size - dimensions, 0)))
+    if graph.lever is None:
+        return by_shift
+    if dimensions == 3:
+        swept = -_product(R, skew(graph.lever))
+    else:
+        swept = _rotated(T_world_j, jnp.stack([-graph.lever[:, 1], graph.lever[:, 0]], -1))[:, :, None]
+    return by_shift + jnp.pad(swept, ((0, 0), (size - dimensions, 0), (0, dimensions)))
+
+
+def _rotated(poses: Poses, vectors: Float[Array, "e k"]) -> Float[Array, "e k"]:
+    return jnp.sum(poses.rotation().as_matrix() * vectors[:, None, :], -1)
 
 
 def _is_unary(graph: PoseGraph) -> Array:

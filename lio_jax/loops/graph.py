@@ -17,7 +17,8 @@ Poses = jaxlie.SEBase
 """SE3 or SE2, all of one kind, with one batch axis."""
 
 ODOMETRY, LOOP, PRIOR, POSITION = range(4)
-"""Kinds of edge. A prior states a vertex's pose, a position its translation, such as a GPS fix."""
+"""Kinds of edge. A prior states a vertex's pose, a position where a point fixed to it is, such as a GPS
+antenna."""
 
 
 class PoseGraph(eqx.Module):
@@ -38,6 +39,9 @@ class PoseGraph(eqx.Module):
     """ODOMETRY, LOOP, PRIOR or POSITION."""
     fixed: Bool[Array, " n"]
     """Vertices that keep their pose."""
+    lever: Float[Array, "e k"] | None = None
+    """Of a position: the point whose place was measured, in the frame of ``j``, m; of other edges not looked
+    at. None: all positions are those of the vertices' own origins."""
 
 
 Status = Literal["converged", "iteration limit", "no further decrease", "not finite"]

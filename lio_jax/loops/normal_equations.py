@@ -68,6 +68,7 @@ def padded(graph: PoseGraph, structure: Structure) -> Padded:
             information=longer(graph.information, more_edges),
             kind=longer(graph.kind, more_edges),
             fixed=longer(graph.fixed, more_vertices, True),
+            lever=None if graph.lever is None else longer(graph.lever, more_edges),
         ),
         places_in(structure),
     )

@@ -8,6 +8,7 @@ from typing import Any
 
 from lio_jax.core.errors import UsageError
 from lio_jax.core.files import atomic_path, folder_lock, remove_leftovers
+from lio_jax.run.keyframe_store import remove_keyframes
 from lio_jax.run.map_file import SPOOL_SUFFIX
 
 RUN_FILES = (
@@ -26,7 +27,7 @@ RUN_FILES = (
     "timings.png",
     "report.html",
 )
-"""What a run may write."""
+"""What a run may write, beside its keyframes."""
 
 _SPOOL = f"map{SPOOL_SUFFIX}"
 
@@ -64,10 +65,12 @@ def run_folder(path: Path, overwrite: bool) -> Iterator[None]:
 def _make_empty(path: Path, overwrite: bool) -> None:
     for name in (*RUN_FILES, _SPOOL):
         remove_leftovers(path / name)
+    remove_keyframes(path, unfinished_only=True)
     if any(path.iterdir()) and not overwrite:
         raise UsageError(f"{path}: exists and is not empty; choose another folder or add --overwrite.")
     for name in RUN_FILES:
         (path / name).unlink(missing_ok=True)
+    remove_keyframes(path)
 
 
 def write_text(path: Path, text: str) -> None:

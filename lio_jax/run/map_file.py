@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.files import aside_of, atomic_path
+from lio_jax.core.files import aside_of
+from lio_jax.run.cloud_file import write_cloud
 
 SPOOL_SUFFIX = ".spool"
 _POINT_BYTES = 3 * np.dtype(np.float32).itemsize
@@ -25,14 +26,11 @@ class MapFile:
 
     def finish(self) -> NDArray[np.float32]:
         """Write the PCD (binary, x y z) and return its (n, 3) points."""
-        from pypcd4 import Encoding, PointCloud
-
         self._spool.close()
         # an interrupted append may have left part of a point behind
         whole = self._spool_path.stat().st_size // _POINT_BYTES
         points = np.fromfile(self._spool_path, np.float32, 3 * whole).reshape(-1, 3)
-        with atomic_path(self._path) as aside:
-            PointCloud.from_xyz_points(points).save(aside, encoding=Encoding.BINARY)
+        write_cloud(self._path, [points], len(points))
         return points
 
     def close(self) -> None:

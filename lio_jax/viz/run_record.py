@@ -13,6 +13,7 @@ from lio_jax.core.errors import LioJaxError
 from lio_jax.data.trajectory import Trajectory, read_tum
 from lio_jax.evaluation.alignment import Alignment, align
 from lio_jax.evaluation.association import MatchedTrajectories, match_by_time
+from lio_jax.run.cloud_file import read_cloud
 
 _NEEDED = ("states.npz", "metrics.json", "config.yaml")
 
@@ -82,9 +83,7 @@ class RunRecord:
         path = self.folder / "map.pcd"
         if not path.is_file():
             return None
-        from pypcd4 import PointCloud
-
-        return PointCloud.from_path(path).numpy(("x", "y", "z"))
+        return read_cloud(path)
 
 
 def read_run(folder: Path) -> RunRecord:

@@ -42,6 +42,18 @@ def test_small_steps_follow_the_radii_of_curvature(latitude: float) -> None:
     np.testing.assert_allclose(enu, [[0, north, 0], [east, 0, 0], [0, 0, 1]], atol=1e-5)
 
 
+def test_nothing_is_lost_over_fifty_kilometres() -> None:
+    """Distances are those between earth-centred positions, and the way back leads to the same place."""
+    random = np.random.default_rng(1)
+    for _ in range(20):
+        origin = (random.uniform(-85, 85), random.uniform(-180, 180), random.uniform(-100, 3000))
+        position = random.uniform(-1, 1, (50, 3)) * [50e3, 50e3, 2e3]
+        geodetic = enu_to_geodetic(position, origin)
+        np.testing.assert_allclose(geodetic_to_enu(geodetic, origin), position, atol=1e-7)
+        apart = np.linalg.norm(np.diff(geodetic_to_ecef(geodetic), axis=0), axis=1)
+        np.testing.assert_allclose(apart, np.linalg.norm(np.diff(position, axis=0), axis=1), atol=1e-7)
+
+
 def test_geodetic_round_trip_over_the_globe() -> None:
     random = np.random.default_rng(0)
     for _ in range(50):

@@ -52,6 +52,7 @@ def test_lio_sams_defaults_are_the_recipes_but_for_what_the_file_fixes(text):
     assert settings.config.data.lidar_topic == "points_raw"
     assert settings.config.data.imu_topic == "imu_raw"
     assert settings.config.data.gps_topic == ""
+    assert not settings.config.backend.gps_elevation
     assert (settings.config.features.rings, settings.config.features.columns) == (16, 1800)
     assert settings.config.imu.heading
     assert not settings.config.imu.orientation
@@ -164,6 +165,15 @@ def test_what_is_mapped_can_be_overridden_and_written_and_read(text):
     assert settings.values["lidar"]["max_range"] == 77.0
     settings.params()
     assert settings_from_yaml(settings.to_yaml(), "config.yaml").as_dict() == settings.as_dict()
+
+
+def test_lio_sams_thresholds_of_gps():
+    theirs = lio_sam(useGpsElevation=True, gpsCovThreshold=3.5, poseCovThreshold=9.0)
+    settings = resolved(theirs)
+    assert settings.config.backend.gps_elevation
+    assert (settings.values["gps"]["max_variance"], settings.values["gps"]["pose_variance"]) == (3.5, 9.0)
+    assert not settings.config.backend.gps
+    assert resolved(theirs, "default").values["gps"] == recipe_settings("default").values["gps"]
 
 
 def test_numbers_that_yaml_reads_as_text():

@@ -44,7 +44,20 @@ def test_odometry_is_taken_as_it_is_in_time_order() -> None:
     np.testing.assert_array_equal(gps.position, [[0, 0, 0], [4, 5, 6]])
     np.testing.assert_array_equal(gps.covariance[0], np.diag([0.5, 0.5, 2.0]))
     assert np.isnan(gps.origin).all()
-    assert notes == ()
+    assert notes == ("GPS: stamps step back 1 time(s); the fixes were put in order by their stamps",)
+
+
+def test_where_the_receiver_was_made_is_no_part_of_the_drive() -> None:
+    """The frame is level where the drive is, not where the first messages place it."""
+    collector = GpsCollector()
+    collector.add(bags.fix_message(1, 31.2, 121.4))
+    for number in range(5):
+        collector.add(bags.fix_message(2 + number, 49.0 + 1e-4 * number, 8.0))
+    gps, notes = collector.gps()
+    assert gps is not None
+    assert gps.stamp_ns.tolist() == [2, 3, 4, 5, 6]
+    assert gps.origin == (49.0, 8.0, 100.0)
+    assert notes == ("GPS: 1 fixes more than 200 km from the others were left out",)
 
 
 def test_no_fix_at_all_is_no_gps() -> None:

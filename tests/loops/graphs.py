@@ -67,8 +67,13 @@ def graph_of(truth, loops, rng, noise=1.0, scale=1e3, information=None):
     )
 
 
-def with_edges(graph, i, j, measurement, information, kind):
-    """Return the graph with further edges."""
+def with_edges(graph, i, j, measurement, information, kind, lever=None):
+    """Return the graph with further edges, their levers where one is given."""
+    if lever is None:
+        levers = graph.lever
+    else:
+        none = np.zeros((len(graph.i), np.shape(lever)[-1]))
+        levers = jnp.concatenate([none if graph.lever is None else graph.lever, jnp.asarray(lever)])
     numbers = np.concatenate([numbers_of(graph.measurement), numbers_of(measurement)])
     return PoseGraph(
         graph.poses,
@@ -78,12 +83,15 @@ def with_edges(graph, i, j, measurement, information, kind):
         jnp.concatenate([graph.information, jnp.asarray(information)]),
         jnp.concatenate([graph.kind, jnp.full(len(i), kind)]),
         graph.fixed,
+        levers,
     )
 
 
 def with_poses(graph, poses, fixed=None):
     fixed = graph.fixed if fixed is None else jnp.asarray(fixed)
-    return PoseGraph(poses, graph.i, graph.j, graph.measurement, graph.information, graph.kind, fixed)
+    return PoseGraph(
+        poses, graph.i, graph.j, graph.measurement, graph.information, graph.kind, fixed, graph.lever
+    )
 
 
 def gtsam_pose(rotation, translation):
@@ -104,7 +112,6 @@ def gtsam_graph(graph):
     space = graph.information.shape[-1] == 6
     between = gtsam.BetweenFactorPose3 if space else gtsam.BetweenFactorPose2
     prior = gtsam.PriorFactorPose3 if space else gtsam.PriorFactorPose2
-    position = gtsam.PoseTranslationPrior3D if space else gtsam.PoseTranslationPrior2D
     equal = gtsam.NonlinearEqualityPose3 if space else gtsam.NonlinearEqualityPose2
     information = np.asarray(graph.information)
     if not space:
@@ -116,7 +123,8 @@ def gtsam_graph(graph):
     ):
         if kind == POSITION:
             weight = information[k][3:, 3:] if space else information[k][:2, :2]
-            factors.add(position(j, gtsam_pose(R[k], t[k]), gtsam.noiseModel.Gaussian.Information(weight)))
+            lever = np.zeros(len(t[k])) if graph.lever is None else np.asarray(graph.lever)[k]
+            factors.add(gtsam_position(j, t[k], lever, gtsam.noiseModel.Gaussian.Information(weight)))
             continue
         noise = gtsam.noiseModel.Gaussian.Information(information[k])
         pose = gtsam_pose(R[k], t[k])
@@ -125,6 +133,21 @@ def gtsam_graph(graph):
     for number in np.flatnonzero(np.asarray(graph.fixed)).tolist():
         factors.add(equal(number, gtsam_pose(R[number], t[number])))
     return factors
+
+
+def gtsam_position(j, fix, lever, noise):
+    """Return gtsam's factor of a GPS antenna; in the plane, where it has none, one made for it."""
+    if len(fix) == 3:
+        return gtsam.GPSFactorArm(j, fix, lever, noise)
+
+    def error(factor, values, jacobians):
+        pose = values.atPose2(j)
+        if jacobians is not None:
+            across = np.array([[-lever[1]], [lever[0]]])
+            jacobians[0] = pose.rotation().matrix() @ np.hstack([np.eye(2), across])
+        return pose.transformFrom(lever) - fix
+
+    return gtsam.CustomFactor(noise, [j], error)
 
 
 def gtsam_optimum(factors, values):

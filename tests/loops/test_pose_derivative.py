@@ -106,8 +106,30 @@ def test_gradient_by_positions(graph):
         assert float(gradient[k, 1]) == pytest.approx(expected, rel=1e-5)
 
 
-def with_edges_traced(graph, poses, information):
-    graph = with_edges(graph, [4, 7], [4, 7], type(poses).identity((2,)), information, POSITION)
+def test_gradient_by_the_lever(graph):
+    """Where the antenna sits is found by gradient as well as any other number."""
+    size, turning = graph.poses.tangent_dim, 3 if graph.poses.tangent_dim == 6 else 1
+    information = np.zeros((2, size, size))
+    information[:, turning:, turning:] = 20 * np.eye(size - turning)
+    fixes = jnp.asarray(translations(graph.poses)[[4, 7]] + 0.3)
+    poses = type(graph.poses).exp(jnp.pad(fixes, ((0, 0), (0, turning))))
+
+    def by_lever(lever):
+        tied = with_edges_traced(graph, poses, information, jnp.zeros((2, size - turning)))
+        levers = jnp.zeros((len(tied.i), size - turning)).at[-2:].set(lever)
+        return loss(solved_poses(eqx.tree_at(lambda g: g.lever, tied, levers)))
+
+    lever = jnp.array([0.7, -0.4, 1.1])[: size - turning]
+    gradient = jax.grad(by_lever)(lever)
+    for k in range(size - turning):
+        shift = STEP * jnp.eye(size - turning)[k]
+        expected = (float(by_lever(lever + shift)) - float(by_lever(lever - shift))) / (2 * STEP)
+        assert float(gradient[k]) == pytest.approx(expected, rel=1e-5)
+
+
+def with_edges_traced(graph, poses, information, lever=None):
+    identity = type(poses).identity((2,))
+    graph = with_edges(graph, [4, 7], [4, 7], identity, information, POSITION, lever)
     numbers = jnp.concatenate([jax.tree.leaves(graph.measurement)[0][:-2], jax.tree.leaves(poses)[0]])
     return eqx.tree_at(lambda g: g.measurement, graph, type(poses)(numbers))
 

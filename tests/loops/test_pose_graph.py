@@ -8,8 +8,9 @@ import pytest
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.loops.chordal import chordal_poses, edges_at
+from lio_jax.loops.factors import linearise, residuals
 from lio_jax.loops.g2o_reader import read_g2o
-from lio_jax.loops.graph import LOOP, POSITION, PRIOR
+from lio_jax.loops.graph import LOOP, POSITION, PRIOR, moved
 from lio_jax.loops.host_poses import numbers_of, rotation_matrices, translations
 from lio_jax.loops.normal_equations import point_after
 from lio_jax.loops.pose_graph import Limits, compile_for, marginal_covariances, solve
@@ -38,7 +39,7 @@ def graph(request):
     return graph_of(walk(request.param, 30, rng), LOOPS, rng)
 
 
-def with_priors_and_positions(graph, rng, priors=(4, 19), positions=(7, 11, 25)):
+def with_priors_and_positions(graph, rng, priors=(4, 19), positions=(7, 11, 25), lever=()):
     """Return the graph tied to the world by measurements instead of a fixed vertex."""
     size = graph.information.shape[-1]
     truth = graph.poses
@@ -52,10 +53,14 @@ def with_priors_and_positions(graph, rng, priors=(4, 19), positions=(7, 11, 25))
         information = random_information(len(positions), size, rng)
         turning = 3 if size == 6 else 1
         information[:, :turning] = information[:, :, :turning] = 0
-        shifts = numbers_of(at(truth, list(positions))).copy()
-        shifts[:, -(size - turning) :] += 0.05 * rng.normal(size=(len(positions), size - turning))
+        own = at(truth, list(positions))
+        levers = np.tile(lever, (len(positions), 1)) if len(lever) else None
+        shifts = numbers_of(own).copy()
+        if levers is not None:
+            shifts[:, turning - size :] += np.einsum("eij,ej->ei", rotation_matrices(own), levers)
+        shifts[:, turning - size :] += 0.05 * rng.normal(size=(len(positions), size - turning))
         fixes = type(truth)(jnp.asarray(shifts))
-        graph = with_edges(graph, positions, positions, fixes, information, POSITION)
+        graph = with_edges(graph, positions, positions, fixes, information, POSITION, levers)
     return with_poses(graph, graph.poses, np.zeros(len(graph.fixed), bool))
 
 
@@ -103,6 +108,70 @@ def test_positions_alone_tie_a_graph_to_the_world(graph):
     assert float(solution.initial_cost) > 10 * float(solution.cost)
 
 
+def lever_in(graph):
+    """Return the place of an antenna in the vertices' frame, far enough to matter."""
+    return np.array([0.8, -1.7, 2.3])[: 3 if graph.information.shape[-1] == 6 else 2]
+
+
+def test_cost_with_a_lever_is_gtsams(graph):
+    graph = with_priors_and_positions(graph, np.random.default_rng(0), lever=lever_in(graph))
+    step = 0.5 * np.random.default_rng(1).normal(size=(30, graph.poses.tangent_dim))
+    there = with_poses(graph, graph.poses @ type(graph.poses).exp(jnp.asarray(step)))
+    expected = gtsam_graph(graph).error(gtsam_values(there.poses))
+    assert float(solve(there, limits=Limits(iterations=0)).initial_cost) == pytest.approx(expected, rel=1e-9)
+
+
+def test_optimum_with_a_lever_is_gtsams(graph):
+    """Beside other edges, and where positions are all that ties the graph to the world."""
+    rng = np.random.default_rng(10)
+    with_priors = with_priors_and_positions(graph, rng, lever=lever_in(graph))
+    agrees_with_gtsam(with_priors, solve(with_priors))
+    alone = with_priors_and_positions(graph, rng, (), (1, 7, 14, 22, 29), lever_in(graph))
+    lost = with_poses(alone, type(alone.poses).exp(jnp.ones(alone.poses.tangent_dim)) @ alone.poses)
+    agrees_with_gtsam(alone, solve(lost))
+
+
+def test_covariances_with_a_lever_are_gtsams(graph):
+    graph = with_priors_and_positions(graph, np.random.default_rng(8), lever=lever_in(graph))
+    agrees_on_covariances(graph, solve(graph))
+
+
+def test_a_lever_makes_one_antenna_tell_the_heading(graph):
+    """Antenna and origin of one vertex both measured: the line between them points somewhere."""
+    rng = np.random.default_rng(11)
+    size = graph.information.shape[-1]
+    with_both = with_priors_and_positions(graph, rng, (), (4,))
+    with_both = with_priors_and_positions(with_both, rng, (), (4,), lever_in(graph))
+    if size == 3:
+        agrees_with_gtsam(with_both, solve(with_both))
+    else:
+        with pytest.raises(LioJaxError, match="leave a pose open"):
+            marginal_covariances(with_both, solve(with_both), [3])
+
+
+def test_linearisation_of_a_position_is_the_finite_difference(graph):
+    graph = with_priors_and_positions(graph, np.random.default_rng(12), lever=lever_in(graph))
+    size = graph.information.shape[-1]
+    T_world_j = at(graph.poses, np.asarray(graph.j))
+    T_world_i = at(graph.poses, np.asarray(graph.i))
+    parts = linearise(graph.poses, graph)
+    is_position = np.asarray(graph.kind) == POSITION
+
+    def gradient(direction):
+        def cost(step):
+            stepped = moved(T_world_j, jnp.asarray(np.tile(step, (len(graph.i), 1))))
+            r = np.asarray(residuals(T_world_i, stepped, graph))
+            return np.einsum("ei,eij,ej->e", r, np.asarray(graph.information), r) / 2
+
+        return (cost(1e-5 * direction) - cost(-1e-5 * direction)) / 2e-5
+
+    expected = np.stack([gradient(direction) for direction in np.eye(size)], -1)
+    np.testing.assert_allclose(
+        np.asarray(parts.g_j)[is_position], expected[is_position], rtol=1e-6, atol=1e-4
+    )
+    assert np.abs(expected[is_position]).max() > 1.0
+
+
 def test_several_fixed_vertices_stay(graph):
     fixed = np.isin(np.arange(30), [0, 11, 29])
     graph = with_poses(graph, graph.poses, fixed)
@@ -138,7 +207,10 @@ def test_parts_are_solved_each_by_itself(graph):
 
 def test_covariances_are_gtsams(graph):
     graph = with_priors_and_positions(graph, np.random.default_rng(8))
-    solution = solve(graph)
+    agrees_on_covariances(graph, solve(graph))
+
+
+def agrees_on_covariances(graph, solution):
     marginals = gtsam.Marginals(gtsam_graph(graph), gtsam_values(solution.poses))
     chosen = [0, 7, 19, 29]
     for number, ours in zip(chosen, marginal_covariances(graph, solution, chosen), strict=True):

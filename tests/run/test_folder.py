@@ -5,10 +5,12 @@ import signal
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from lio_jax.core.errors import UsageError
 from lio_jax.run.folder import RUN_FILES, run_folder, write_json
+from lio_jax.run.keyframe_store import KeyframeWriter
 
 
 def test_makes_the_folder_and_its_parents(tmp_path):
@@ -50,6 +52,36 @@ def test_overwriting_removes_results_and_nothing_else(tmp_path):
         (tmp_path / name).touch()
     with run_folder(tmp_path, overwrite=True):
         assert [entry.name for entry in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def with_keyframes(folder, finished):
+    writer = KeyframeWriter(folder)
+    writer.append(np.zeros((4, 3), np.float32))
+    if finished:
+        writer.finish(np.zeros(1, np.int64), np.eye(4)[None], np.eye(4)[None])
+    (folder / "keyframes" / ".000001.0123abcd.npz").touch()
+
+
+def test_keyframes_of_a_run_that_ended_are_removed_by_overwriting_only(tmp_path):
+    with_keyframes(tmp_path, finished=True)
+    with pytest.raises(UsageError, match=r"not empty"), run_folder(tmp_path, overwrite=False):
+        pass
+    assert (tmp_path / "keyframes" / "000000.npz").exists()
+    with run_folder(tmp_path, overwrite=True):
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_keyframes_of_a_killed_run_are_nobody_s(tmp_path):
+    with_keyframes(tmp_path, finished=False)
+    with run_folder(tmp_path, overwrite=False):
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_what_others_put_among_the_keyframes_stays(tmp_path):
+    with_keyframes(tmp_path, finished=True)
+    (tmp_path / "keyframes" / "labels.npz").touch()
+    with run_folder(tmp_path, overwrite=True):
+        assert [entry.name for entry in (tmp_path / "keyframes").iterdir()] == ["labels.npz"]
 
 
 def test_refuses_a_file_even_if_it_may_overwrite(tmp_path):

@@ -1,0 +1,89 @@
+"""GPS fixes made safe to use: finite, ascending in time, each with a covariance; and what was wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.errors import LioJaxError
+from lio_jax.data.order import ascending
+from lio_jax.data.sequence import GpsData
+
+_UNSTATED_SIGMA = (5.0, 5.0, 10.0)
+"""m, east north up: of a plain receiver, where the recording states no covariance."""
+_ROUNDING = 1e-3
+"""Of a covariance's trace: so far off symmetric it may be."""
+_FARTHEST = 1e6
+"""m; a position farther from the frame's origin is a fault of the recording."""
+
+
+def cleaned(gps: GpsData, source: str) -> tuple[GpsData, tuple[str, ...]]:
+    """Drop fixes that cannot be used, give each a covariance, and say what was done.
+
+    Dropped are positions that are not finite or impossibly far, (0, 0) of a receiver that has no frame yet,
+    and stamps that repeat or step back. A covariance that is none stands for an unknown one.
+
+    Args:
+        gps: in recorded order.
+        source: what the sentences begin with: file or topic.
+
+    Raises:
+        LioJaxError: stamps, positions and covariances are not of one length.
+    """
+    count = len(gps.stamp_ns)
+    if gps.position.shape != (count, 3) or gps.covariance.shape != (count, 3, 3):
+        raise LioJaxError(
+            f"{source}: {count} GPS stamps, but positions of shape {gps.position.shape} and covariances of "
+            f"shape {gps.covariance.shape}; write (n, 3) and (n, 3, 3)."
+        )
+    said = []
+    possible = np.asarray((np.abs(gps.position) < _FARTHEST).all(axis=1))
+    if not possible.all():
+        said.append(f"{np.sum(~possible)} GPS fix(es) without a possible position were left out.")
+    if not np.isfinite(gps.origin).all():
+        unset = possible & ~gps.position[:, :2].any(axis=1)
+        if unset.any():
+            said.append(f"{np.sum(unset)} GPS fix(es) at (0, 0) were left out: the receiver had none yet.")
+        possible &= ~unset
+    gps = _at(gps, np.flatnonzero(possible))
+    kept = np.array(ascending(gps.stamp_ns.tolist()), np.int64)
+    if len(kept) < len(gps.stamp_ns):
+        said.append(
+            f"{len(gps.stamp_ns) - len(kept)} GPS fix(es) whose stamp repeats, steps back or leaps ahead "
+            "were left out."
+        )
+    gps = _at(gps, kept)
+    covariance, unstated = with_covariances(gps.covariance)
+    if unstated:
+        said.append(f"{unstated}.")
+    return replace(gps, covariance=covariance), tuple(f"{source}: {sentence}" for sentence in said)
+
+
+def with_covariances(covariance: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
+    """Put a plain receiver's covariance in place of what is none, and say so; "" where all are stated.
+
+    None is what is not finite, not symmetric or not positive definite, such as zeros.
+
+    Args:
+        covariance: (n, 3, 3) m^2, east north up.
+    """
+    finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
+    own = np.where(finite[:, None, None], covariance, 0.0)
+    turned = own.transpose(0, 2, 1)
+    skewed = np.abs(own - turned).max(axis=(1, 2), initial=0.0)
+    scale = np.trace(own, axis1=1, axis2=2)
+    own = (own + turned) / 2
+    stated = np.asarray((skewed <= _ROUNDING * scale) & (np.linalg.eigvalsh(own)[:, 0] > 0))
+    if stated.all():
+        return own, ""
+    note = (
+        f"{np.sum(~stated)} of {len(stated)} fixes state no covariance: "
+        f"{_UNSTATED_SIGMA[0]:g} m horizontally and {_UNSTATED_SIGMA[2]:g} m vertically were assumed"
+    )
+    return np.where(stated[:, None, None], own, np.diag(np.square(_UNSTATED_SIGMA))), note
+
+
+def _at(gps: GpsData, index: NDArray[np.int64]) -> GpsData:
+    return replace(
+        gps, stamp_ns=gps.stamp_ns[index], position=gps.position[index], covariance=gps.covariance[index]
+    )
