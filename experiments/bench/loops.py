@@ -191,7 +191,7 @@ def town(
         loop: crossings of the grid of blocks where it turns, counterclockwise; None: 1.1 km.
         spacing: of the keyframes, m.
     """
-    from simulated_keyframes import drifted, driven, keyframes_of, rounded
+    from simulated_keyframes import drifted, driven, keyframes_of, rounded, times_along
 
     from lio_jax.sim.blocks import LANE, PITCH
     from lio_jax.sim.blocks import lap as lap_of
@@ -204,7 +204,7 @@ def town(
     second = driven(world, path if again > 0 else path[::-1], aside - LANE)
     truth = np.concatenate([first, second])
     odometry = drifted(truth, scale=0.01, heading=2.5e-4, noise=0.02, seed=seed)
-    return keyframes_of(world, truth, odometry, seed=seed), truth
+    return keyframes_of(world, truth, odometry, times_along(truth), seed=seed), truth
 
 
 def tunnel() -> Drive:
@@ -217,7 +217,7 @@ def tunnel() -> Drive:
     there = np.stack([np.arange(0.0, 660.0), np.zeros(660)], axis=1)
     truth = np.concatenate([driven(world, there, above=3.0), driven(world, there[::-1], above=3.0)])
     odometry = drifted(truth, scale=0.02, heading=0.0, noise=0.02)
-    return keyframes_of(world, truth, odometry), truth
+    return keyframes_of(world, truth, odometry, times_along(truth)), truth
 
 
 def alike(length: float = 700.0, spacing: float = 1.0) -> Drive:
@@ -225,7 +225,7 @@ def alike(length: float = 700.0, spacing: float = 1.0) -> Drive:
 
     No place is seen twice.
     """
-    from simulated_keyframes import drifted, driven, keyframes_of, rounded
+    from simulated_keyframes import drifted, driven, keyframes_of, rounded, times_along
 
     pitch = 60.0
     world = town_of_equal_blocks(pitch, int(length / pitch) + 4, 4)
@@ -234,7 +234,7 @@ def alike(length: float = 700.0, spacing: float = 1.0) -> Drive:
     path = around[(around[:, 0] > 10) | (np.arange(len(around)) > 20)][: int((2 * length + 20) / spacing)]
     truth = driven(world, path, above=3.0)
     odometry = drifted(truth, scale=-0.02, heading=0.0, noise=0.02)
-    return keyframes_of(world, truth, odometry), truth
+    return keyframes_of(world, truth, odometry, times_along(truth)), truth
 
 
 def town_of_equal_blocks(pitch: float, columns: int, rows: int) -> Any:

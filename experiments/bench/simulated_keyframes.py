@@ -93,21 +93,25 @@ def drifted(poses: _Array, scale: float, heading: float, noise: float = 0.0, see
     return result
 
 
+def times_along(poses: _Array, speed: float = 8.0) -> _Array:
+    """Return when a body with constant speed passes poses, (n,) s from the first."""
+    way = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(way)]) / speed
+
+
 def keyframes_of(
-    world: World, poses: _Array, odometry: _Array, speed: float = 8.0, lidar: Lidar = SPARSE, seed: int = 0
+    world: World, poses: _Array, odometry: _Array, times: _Array, lidar: Lidar = SPARSE, seed: int = 0
 ) -> list[Keyframe]:
-    """Return what is seen from poses, (k,), one after the other at a constant speed.
+    """Return what is seen from poses one after the other, (k,).
 
     Args:
         world: what is seen.
         poses: (k, 4, 4) T_world_imu; lidar and IMU coincide.
         odometry: (k, 4, 4) what the keyframes say.
-        speed: m/s.
+        times: (k,) s.
         lidar: the sensor; it stands still during a sweep.
         seed: of the sensor's noise.
     """
-    way = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    times = np.concatenate([[0.0], np.cumsum(way)]) / speed
     keyframes = []
     with jax.enable_x64(True):
         found = counts_along(world, jnp.asarray(poses[:, :3, 3]), 101.0)

@@ -23,6 +23,8 @@ _COARSE = 2.0
 _COARSE_ERROR, _FINE_ERROR = 1.5, 0.5
 """... as the guesses and the first result may be wrong by about this, m: it opens the robust kernel."""
 _ITERATIONS = 30
+_REACH = 1e5
+"""No voxel is farther than this from the target, m: none is forgotten."""
 
 
 class Alignments(NamedTuple):
@@ -117,6 +119,6 @@ def _map_of(points: Float32[Array, "m 3"], mask: Bool[Array, " m"], voxel_size: 
         mask,
         jnp.zeros(3, jnp.int32),
         voxel_size.astype(jnp.float32),
-        jnp.array(jnp.inf, jnp.float32),
+        jnp.float32(_REACH),
     )
     return vmap

@@ -34,9 +34,6 @@ class LoopCloser:
     made of.
     """
 
-    untried: list[Pair]
-    """Pairs from outside of which a time lies before the first keyframe, or both with the same one."""
-
     def __init__(self, settings: Settings) -> None:
         """Begin with no keyframe.
 
@@ -54,7 +51,7 @@ class LoopCloser:
         self._run: list[float] = []
         """What the odometry has run up to each keyframe, m."""
         self._refused: list[Verdict] = []
-        self.untried: list[Pair] = []
+        self._without_keyframes: list[Pair] = []
 
     @property
     def closed(self) -> list[Verdict]:
@@ -116,7 +113,7 @@ class LoopCloser:
     ) -> list[Proposal]:
         source, target = (keyframe_at(keyframes, stamp) for stamp in (pair.later_ns, pair.earlier_ns))
         if source is None or target is None or source == target:
-            self.untried.append(pair)
+            self._without_keyframes.append(pair)
             return []
         metres = float(metres_from(source, run, ends)[target])
         return [external_proposal(source, target, pair.T_earlier_later, poses, metres, self._limits)]
@@ -126,3 +123,7 @@ class LoopCloser:
         waiting = [replace(loop, accepted=False, reason=_UNCONFIRMED) for loop in self._consensus.waiting]
         every = [*self._consensus.entered, *waiting, *self._refused]
         return sorted(every, key=lambda verdict: verdict.proposal.source)
+
+    def untried(self) -> list[Pair]:
+        """Return pairs from outside that belong to no two keyframes so far."""
+        return [*self._without_keyframes, *self._pairs]

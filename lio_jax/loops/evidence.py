@@ -21,12 +21,9 @@ class Agreement:
         """Arrange a map's points, (m, 3) m."""
         self._tree = cKDTree(target, balanced_tree=False, compact_nodes=False)
 
-    def distances(
-        self, source: NDArray[np.float32], T_target_source: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return each source point's distance to the nearest of the map's, infinite beyond 1 m, (n,) m."""
-        placed = source @ T_target_source[:3, :3].T + T_target_source[:3, 3]
-        return np.asarray(self._tree.query(placed, distance_upper_bound=_NEAR)[0])
+    def distances(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return each point's distance to the nearest of the map's, infinite beyond 1 m, (n,) m."""
+        return np.asarray(self._tree.query(points, distance_upper_bound=_NEAR)[0])
 
 
 def fitness_of(distances: NDArray[np.float64]) -> float:

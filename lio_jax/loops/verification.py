@@ -8,12 +8,14 @@ that repeat themselves.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.param_values import DEFAULTS
@@ -32,6 +34,8 @@ _Array = NDArray[np.float64]
 
 _SPACING = 0.4
 """Of the points that are aligned, m."""
+_SEEN_WELL = 25.0
+"""Only what is nearer than this to a keyframe of the target is judged, m: the rest was seen thinly."""
 _LEAST_UPRIGHT = 100
 """Points of upright things without which there is nothing to compare."""
 _OTHER_FIT = (2.0, 0.15)
@@ -95,16 +99,16 @@ def verify(proposal: Proposal, keyframes: Sequence[Keyframe], poses: _Array, set
     )
     if not len(found.turn):
         return refused(proposal, "no fit within the odometry's possible error")
+    stations = poses[members, :3, 3] - poses[target, :3, 3]
     result = aligned(
         *padded(theirs, sizes.target_points),
         *padded(ours, sizes.source_points),
-        _guesses(found, poses[members, :3, 3] - poses[target, :3, 3]),
+        _guesses(found, stations),
         sizes.starts,
-        _params(limits),
+        _params(limits["voxel_size"], state_dtype()),
     )
-    candidates = _candidates(
-        result, Agreement(theirs), ours[our_upright], poses[[target, source]], limits["overlap_distance"]
-    )
+    comparison = _Comparison(theirs, stations, ours[our_upright], limits["overlap_distance"])
+    candidates = comparison.candidates(result, poses[[target, source]])
     seen = level_points(keyframes, poses, source, [source], TARGET_REACH)
 
     def conflicting(T: _Array) -> float:
@@ -130,28 +134,47 @@ class _Candidate:
     """Against the vertical they have, rad."""
 
 
-def _candidates(
-    result: Alignments, agreement: Agreement, ours: NDArray[np.float32], poses: _Array, within: float
-) -> list[_Candidate]:
-    """Return the alignments that converged, the one that agrees best first."""
-    candidates = []
-    offset = poses[1, :3, 3] - poses[0, :3, 3]
-    for row in np.flatnonzero(result.converged):
-        T = result.T_target_source[row]
-        distances = agreement.distances(ours, T)
-        candidates.append(
-            _Candidate(
-                T_target_source=T,
-                information=result.information[row],
-                degenerate=bool(result.degenerate[row]),
-                overlap=float(np.mean(distances < within)),
-                fitness=fitness_of(distances),
-                shift=float(np.linalg.norm(T[:3, 3] - offset)),
-                turn=float(abs(_heading(T))),
-                tilt=float(np.arccos(np.clip(T[2, 2], -1, 1))),
+class _Comparison:
+    """The surroundings of two keyframes, to be compared under any alignment."""
+
+    def __init__(
+        self, theirs: NDArray[np.float32], stations: _Array, ours: NDArray[np.float32], within: float
+    ) -> None:
+        """Take what both saw, and where.
+
+        Args:
+            theirs: (m, 3) m, in the target's level axes.
+            stations: (k, 3) m, where the target's keyframes were.
+            ours: (n, 3) m, of upright things in the source's level axes.
+            within: a point agrees if theirs has one nearer than this, m.
+        """
+        self._agreement, self._stations = Agreement(theirs), cKDTree(stations)
+        self._ours, self._within = ours, within
+
+    def candidates(self, result: Alignments, poses: _Array) -> list[_Candidate]:
+        """Return the alignments that converged, the one that agrees best first."""
+        offset = poses[1, :3, 3] - poses[0, :3, 3]
+        candidates = []
+        for row in np.flatnonzero(result.converged):
+            T = result.T_target_source[row]
+            placed = self._ours @ T[:3, :3].T + T[:3, 3]
+            judged = placed[self._stations.query(placed, distance_upper_bound=_SEEN_WELL)[0] < _SEEN_WELL]
+            if len(judged) < _LEAST_UPRIGHT:
+                continue
+            distances = self._agreement.distances(judged)
+            candidates.append(
+                _Candidate(
+                    T_target_source=T,
+                    information=result.information[row],
+                    degenerate=bool(result.degenerate[row]),
+                    overlap=float(np.mean(distances < self._within)),
+                    fitness=fitness_of(distances),
+                    shift=float(np.linalg.norm(T[:3, 3] - offset)),
+                    turn=abs(_heading(T)),
+                    tilt=float(np.arccos(np.clip(T[2, 2], -1, 1))),
+                )
             )
-        )
-    return sorted(candidates, key=lambda candidate: -candidate.overlap)
+        return sorted(candidates, key=lambda candidate: -candidate.overlap)
 
 
 def _judged(
@@ -254,9 +277,10 @@ def _guesses(found: Fits, targets: _Array) -> _Array:
     return guesses
 
 
-def _params(limits: dict[str, Any]) -> Params:
+@cache
+def _params(voxel_size: float, dtype: jnp.dtype) -> Params:
     """Return parameters of the alignment, which is the same whatever the recipe."""
-    size = jnp.asarray(limits["voxel_size"], state_dtype())
+    size = jnp.asarray(voxel_size, dtype)
     return eqx.tree_at(lambda params: params.map.voxel_size, default_params(), size)
 
 
