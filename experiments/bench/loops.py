@@ -179,7 +179,13 @@ def _drives() -> dict[str, Callable[[], Drive]]:
 
 
 def town(
-    name: str, seed: int, again: float, aside: float = 0.0, loop: Any = None, spacing: float = 1.0
+    name: str,
+    seed: int,
+    again: float,
+    aside: float = 0.0,
+    loop: Any = None,
+    spacing: float = 1.0,
+    speed: float = 8.0,
 ) -> Drive:
     """Return a drive around a loop twice, in the right lane.
 
@@ -190,6 +196,7 @@ def town(
         aside: the second time so much farther to the left, m.
         loop: crossings of the grid of blocks where it turns, counterclockwise; None: 1.1 km.
         spacing: of the keyframes, m.
+        speed: m/s.
     """
     from simulated_keyframes import drifted, driven, keyframes_of, rounded, times_along
 
@@ -203,8 +210,8 @@ def town(
     first = driven(world, path, -LANE)
     second = driven(world, path if again > 0 else path[::-1], aside - LANE)
     truth = np.concatenate([first, second])
-    odometry = drifted(truth, scale=0.01, heading=2.5e-4, noise=0.02, seed=seed)
-    return keyframes_of(world, truth, odometry, times_along(truth), seed=seed), truth
+    odometry = drifted(truth, scale=0.01, heading=1.2e-4, noise=0.02, seed=seed)
+    return keyframes_of(world, truth, odometry, times_along(truth, speed), seed=seed), truth
 
 
 def tunnel() -> Drive:

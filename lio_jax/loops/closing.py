@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lio_jax.core.settings import Settings
 from lio_jax.loops.consistency import Consensus, consistent
-from lio_jax.loops.drift import metres_from
+from lio_jax.loops.drift import AT_LEAST, metres_from
 from lio_jax.loops.external_pairs import Pair, keyframe_at, read_pairs
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.loops.place_descriptor import Places
@@ -75,7 +75,7 @@ class LoopCloser:
         step = keyframes[-1].T_odom_imu[:3, 3] - keyframes[-2 if len(keyframes) > 1 else -1].T_odom_imu[:3, 3]
         self._run.append(self._run[-1] + float(np.linalg.norm(step)) if self._run else 0.0)
         run = np.array(self._run)
-        ends = [(loop.proposal.source, loop.proposal.target) for loop in self._consensus.entered]
+        ends = held_by(poses, self._consensus.entered)
         metres = metres_from(len(keyframes) - 1, run, ends)
         old = is_old(keyframes, len(keyframes) - 1, self._limits["time_gap"])
         proposals = nearest_proposal(poses, old, metres, self._limits)
@@ -127,3 +127,20 @@ class LoopCloser:
     def untried(self) -> list[Pair]:
         """Return pairs from outside that belong to no two keyframes so far."""
         return [*self._without_keyframes, *self._pairs]
+
+
+def held_by(poses: NDArray[np.float64], loops: Sequence[Verdict]) -> list[tuple[int, int]]:
+    """Return the ends of the loops that poses agree with: neither ignored so far nor distrusted by the graph.
+
+    Args:
+        poses: (k, 4, 4) T_world_imu.
+        loops: that entered the graph.
+    """
+    if not loops:
+        return []
+    ends = np.array([(loop.proposal.source, loop.proposal.target) for loop in loops])
+    measured = np.array([loop.T_target_source for loop in loops])
+    wrong = np.linalg.inv(poses[ends[:, 0]]) @ poses[ends[:, 1]] @ measured
+    turned = np.arccos(np.clip((np.trace(wrong[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
+    moved = np.linalg.norm(wrong[:, :3, 3], axis=1)
+    return [(int(a), int(b)) for a, b in ends[(moved < AT_LEAST.position) & (turned < AT_LEAST.heading)]]

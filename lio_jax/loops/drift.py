@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-_POSITION, _HEADING = 1.0, 0.1
-"""Errors that are possible however short the way, m and rad: the keyframes' clouds are thinned."""
 _ACROSS = 1.0
 """A closed loop is as sure as this much odometry, m."""
 
@@ -23,6 +21,10 @@ class Error(NamedTuple):
     """rad."""
 
 
+AT_LEAST = Error(np.array(1.0), np.array(0.1))
+"""What is possible however short the way: the keyframes' clouds are thinned."""
+
+
 def possible_error(metres: NDArray[np.float64] | float, limits: dict[str, Any]) -> Error:
     """Return how wrong relative poses may be after so many metres of odometry.
 
@@ -30,9 +32,10 @@ def possible_error(metres: NDArray[np.float64] | float, limits: dict[str, Any]) 
         metres: run between the two poses.
         limits: ``params.loop`` as plain numbers.
     """
-    metres = np.asarray(metres, np.float64)
-    heading = np.minimum(_HEADING + limits["heading_drift"] * metres, np.pi)
-    return Error(_POSITION + limits["drift"] * metres, heading)
+    run = np.asarray(metres, np.float64)
+    position = np.asarray(AT_LEAST.position + limits["drift"] * run)
+    heading = np.minimum(AT_LEAST.heading + limits["heading_drift"] * run, np.pi)
+    return Error(position, np.asarray(heading))
 
 
 def metres_from(

@@ -15,16 +15,17 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.param_values import DEFAULTS
 from lio_jax.core.params import Params, default_params
 from lio_jax.core.settings import Settings
 from lio_jax.core.types import state_dtype
-from lio_jax.loops.alignment import Alignments, aligned
+from lio_jax.loops.alignment import aligned
+from lio_jax.loops.comparison import LEAST_POINTS, Candidate, Comparison
 from lio_jax.loops.drift import possible_error
-from lio_jax.loops.evidence import Agreement, conflict, fitness_of
+from lio_jax.loops.evidence import conflict
+from lio_jax.loops.host_poses import heading_of
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.loops.plan_view import SOURCE_REACH, TARGET_REACH, Fits, fits, upright_cells
 from lio_jax.loops.proposals import Proposal, is_old
@@ -34,10 +35,6 @@ _Array = NDArray[np.float64]
 
 _SPACING = 0.4
 """Of the points that are aligned, m."""
-_SEEN_WELL = 25.0
-"""Only what is nearer than this to a keyframe of the target is judged, m: the rest was seen thinly."""
-_LEAST_UPRIGHT = 100
-"""Points of upright things without which there is nothing to compare."""
 _OTHER_FIT = (2.0, 0.15)
 """Two fits are not the same if they are farther apart than this, m and rad."""
 
@@ -84,14 +81,14 @@ def verify(proposal: Proposal, keyframes: Sequence[Keyframe], poses: _Array, set
     theirs, ours = thinned(theirs, _SPACING), thinned(ours, _SPACING)
     their_cells, their_upright = upright_cells(theirs)
     our_cells, our_upright = upright_cells(ours)
-    if min(np.sum(their_upright), np.sum(our_upright)) < _LEAST_UPRIGHT:
+    if min(np.sum(their_upright), np.sum(our_upright)) < LEAST_POINTS:
         return refused(proposal, "nothing upright to compare")
 
     level = _level(proposal.T_target_source, poses[target], poses[source])
     found = fits(
         our_cells,
         their_cells,
-        _heading(level),
+        heading_of(level),
         proposal.turn_error,
         level[:2, 3],
         proposal.shift_error,
@@ -107,7 +104,7 @@ def verify(proposal: Proposal, keyframes: Sequence[Keyframe], poses: _Array, set
         sizes.starts,
         _params(limits["voxel_size"], state_dtype()),
     )
-    comparison = _Comparison(theirs, stations, ours[our_upright], limits["overlap_distance"])
+    comparison = Comparison(theirs, stations, ours[our_upright], limits["overlap_distance"])
     candidates = comparison.candidates(result, poses[[target, source]])
     seen = level_points(keyframes, poses, source, [source], TARGET_REACH)
 
@@ -117,69 +114,9 @@ def verify(proposal: Proposal, keyframes: Sequence[Keyframe], poses: _Array, set
     return _judged(proposal, candidates, conflicting, poses[[target, source]], limits)
 
 
-@dataclass(frozen=True, eq=False)
-class _Candidate:
-    """An alignment and what speaks for it, in level axes."""
-
-    T_target_source: _Array
-    information: _Array
-    degenerate: bool
-    overlap: float
-    fitness: float
-    shift: float
-    """From where the poses so far have the source, m."""
-    turn: float
-    """From the heading they have, rad."""
-    tilt: float
-    """Against the vertical they have, rad."""
-
-
-class _Comparison:
-    """The surroundings of two keyframes, to be compared under any alignment."""
-
-    def __init__(
-        self, theirs: NDArray[np.float32], stations: _Array, ours: NDArray[np.float32], within: float
-    ) -> None:
-        """Take what both saw, and where.
-
-        Args:
-            theirs: (m, 3) m, in the target's level axes.
-            stations: (k, 3) m, where the target's keyframes were.
-            ours: (n, 3) m, of upright things in the source's level axes.
-            within: a point agrees if theirs has one nearer than this, m.
-        """
-        self._agreement, self._stations = Agreement(theirs), cKDTree(stations)
-        self._ours, self._within = ours, within
-
-    def candidates(self, result: Alignments, poses: _Array) -> list[_Candidate]:
-        """Return the alignments that converged, the one that agrees best first."""
-        offset = poses[1, :3, 3] - poses[0, :3, 3]
-        candidates = []
-        for row in np.flatnonzero(result.converged):
-            T = result.T_target_source[row]
-            placed = self._ours @ T[:3, :3].T + T[:3, 3]
-            judged = placed[self._stations.query(placed, distance_upper_bound=_SEEN_WELL)[0] < _SEEN_WELL]
-            if len(judged) < _LEAST_UPRIGHT:
-                continue
-            distances = self._agreement.distances(judged)
-            candidates.append(
-                _Candidate(
-                    T_target_source=T,
-                    information=result.information[row],
-                    degenerate=bool(result.degenerate[row]),
-                    overlap=float(np.mean(distances < self._within)),
-                    fitness=fitness_of(distances),
-                    shift=float(np.linalg.norm(T[:3, 3] - offset)),
-                    turn=abs(_heading(T)),
-                    tilt=float(np.arccos(np.clip(T[2, 2], -1, 1))),
-                )
-            )
-        return sorted(candidates, key=lambda candidate: -candidate.overlap)
-
-
 def _judged(
     proposal: Proposal,
-    candidates: list[_Candidate],
+    candidates: list[Candidate],
     conflicting: Callable[[_Array], float],
     poses: _Array,
     limits: dict[str, Any],
@@ -207,7 +144,7 @@ def _judged(
         other.overlap
         for other in others
         if np.linalg.norm(other.T_target_source[:3, 3] - best.T_target_source[:3, 3]) > apart
-        or abs(_wrapped(_heading(other.T_target_source) - _heading(best.T_target_source))) > turned
+        or abs(_wrapped(heading_of(other.T_target_source) - heading_of(best.T_target_source))) > turned
     ]
     rival = max(rivals, default=0.0) / max(best.overlap, 1e-9)
     against = conflicting(best.T_target_source)
@@ -282,10 +219,6 @@ def _params(voxel_size: float, dtype: jnp.dtype) -> Params:
     """Return parameters of the alignment, which is the same whatever the recipe."""
     size = jnp.asarray(voxel_size, dtype)
     return eqx.tree_at(lambda params: params.map.voxel_size, default_params(), size)
-
-
-def _heading(pose: _Array) -> float:
-    return float(np.arctan2(pose[1, 0], pose[0, 0]))
 
 
 def _wrapped(angle: float) -> float:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from lio_jax.core.settings import Settings
-from lio_jax.loops.closing import LoopCloser
+from lio_jax.loops.closing import LoopCloser, held_by
 from lio_jax.loops.proposals import Proposal
 from lio_jax.loops.verification import Verdict
 from tests.experiments import bench_path  # noqa: F401
@@ -77,3 +77,29 @@ def test_pairs_from_outside_are_proposed_when_their_later_time_has_come(tmp_path
         proposed |= {index: [(one.source, one.target, one.origin) for one in found]} if found else {}
     assert proposed == {5: [(4, 0, "external")]}
     assert [pair.line for pair in closer.untried] == [2, 3, 4]
+
+
+def test_only_loops_that_the_poses_agree_with_are_short_cuts():
+    poses = np.array([pose(), pose(50), pose(52, yaw=0.02), pose(0.4)])
+    right, ignored, distrusted = verdict(3, 0), verdict(2, 0), verdict(2, 1, pose(2, yaw=0.3))
+    assert held_by(poses, [right, ignored, distrusted, verdict(2, 1, pose(2))]) == [(3, 0), (2, 1)]
+    assert held_by(poses, []) == []
+
+
+@pytest.fixture(scope="module")
+def twice_around_a_block():
+    """Twice around a block of the city, the second time in the other lane and direction, with 4 m steps."""
+    return town("city", 0, -1.0, loop=[(0, 0), (1, 0), (1, 1), (0, 1)], spacing=4.0, speed=5.0)
+
+
+def test_a_loop_driven_twice_is_closed_wherever_it_is_driven_again(twice_around_a_block):
+    keyframes, truth = twice_around_a_block
+    closer, _ = closed(keyframes)
+    again = set(revisits(keyframes, truth).tolist())
+    loops = closer.closed
+    assert len(again) > 40
+    assert len(again & {loop.proposal.source for loop in loops}) >= 0.95 * len(again)
+    for loop in loops:
+        moved, turned = error_of(loop.T_target_source, truth, loop.proposal.source, loop.proposal.target)
+        assert moved < 0.5
+        assert turned < 0.02
