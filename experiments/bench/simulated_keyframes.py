@@ -23,7 +23,7 @@ SPARSE = spinning_lidar(16, 512, elevation_deg=(-15.0, 15.0))
 """16 beams, 512 firings a turn."""
 _BODY_HEIGHT = 1.6
 _SPACING = 0.4
-_COVARIANCE = np.diag([1e-3**2] * 3 + [2e-2**2] * 3)
+_COVARIANCE = np.diag([5e-3**2] * 3 + [5e-2**2] * 3)
 """Of a step: what a bad odometry should say of itself."""
 
 

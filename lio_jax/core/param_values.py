@@ -100,7 +100,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "descriptor_distance": 0.5,
         "voxel_size": 1.2,
         "overlap_distance": 0.5,
-        "overlap": 0.7,
+        "overlap": 0.6,
         "fitness": 0.3,
         "conflict": 0.25,
         "rival": 0.9,

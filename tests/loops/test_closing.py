@@ -1,12 +1,13 @@
 """Loops one keyframe after the other: nothing is lost, and places that look alike are not confused."""
 
 import numpy as np
+import pytest
+from loops import closed, error_of, revisits, town
 
 from lio_jax.core.settings import Settings
 from lio_jax.loops.closing import LoopCloser, held_by
 from lio_jax.loops.proposals import Proposal
 from lio_jax.loops.verification import Verdict
-from tests.experiments import bench_path  # noqa: F401
 from tests.loops.places import keyframe, pose
 
 
@@ -76,7 +77,7 @@ def test_pairs_from_outside_are_proposed_when_their_later_time_has_come(tmp_path
         found = closer.proposals_for(keyframes, np.array([one.T_odom_imu for one in keyframes]))
         proposed |= {index: [(one.source, one.target, one.origin) for one in found]} if found else {}
     assert proposed == {5: [(4, 0, "external")]}
-    assert [pair.line for pair in closer.untried] == [2, 3, 4]
+    assert [pair.line for pair in closer.untried()] == [2, 3, 4]
 
 
 def test_only_loops_that_the_poses_agree_with_are_short_cuts():

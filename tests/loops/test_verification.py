@@ -15,13 +15,12 @@ from lio_jax.sim.assembly import assembled
 from lio_jax.sim.blocks import LANE, lap
 from lio_jax.sim.lidar import spinning_lidar
 from lio_jax.sim.world_registry import build
-from tests.experiments import bench_path  # noqa: F401
 from tests.loops.places import pose
 
 SETTINGS = Settings()
 LIMITS = SETTINGS.values["loop"]
 SENSOR = spinning_lidar(16, 360, elevation_deg=(-15.0, 15.0))
-FIRST, AGAIN, SPACING = 40, 8, 2.0
+FIRST, AGAIN, SPACING = 40, 10, 2.0
 """Keyframes of the first pass and of the second, and the way between them, m."""
 WRONG = pose(6.0, -7.0, 0.5, 0.12)
 """What the odometry has gathered between the passes, about the second one's end."""
