@@ -182,6 +182,28 @@ class BackendConfig:
 
 
 @dataclass(frozen=True)
+class LoopsConfig:
+    """Sizes of what is compared where a place may have been seen before."""
+
+    pairs: str = ""
+    """File of pairs of times at which the same place was seen, by whatever other method; empty: none."""
+    submap_keyframes: int = 25
+    """Keyframes on either side of an earlier one that make up its surroundings."""
+    source_keyframes: int = 10
+    """Keyframes up to the newest that are compared with these surroundings together."""
+    source_points: int = 2048
+    """Capacity of the points to be aligned, after thinning."""
+    target_points: int = 65536
+    """Capacity of the surroundings, after thinning."""
+    starts: int = 5
+    """Alignments that are tried: the best one and its rivals."""
+    rings: int = 20
+    """Of a place's descriptor, from the sensor outwards."""
+    sectors: int = 60
+    """Of a place's descriptor, all around."""
+
+
+@dataclass(frozen=True)
 class OutputConfig:
     """Which of the optional files a run folder gets."""
 
@@ -214,6 +236,7 @@ class Config:
     loam: LoamConfig = field(default_factory=LoamConfig)
     lio_sam: LioSamConfig = field(default_factory=LioSamConfig)
     backend: BackendConfig = field(default_factory=BackendConfig)
+    loops: LoopsConfig = field(default_factory=LoopsConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
 
 

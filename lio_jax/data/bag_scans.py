@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError
+from lio_jax.core.timestamps import ns_to_seconds
 from lio_jax.data import livox
 from lio_jax.data.bag_topics import Topic
 from lio_jax.data.beam_layout import check_beams
@@ -17,7 +18,6 @@ from lio_jax.data.pointcloud2 import decode_pointcloud2
 from lio_jax.data.raw_cloud import RawCloud
 from lio_jax.data.reconstruct import azimuth_time, guess_beams, ring_from_elevation
 from lio_jax.data.sequence import LidarScan
-from lio_jax.data.trajectory import ns_to_seconds
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from lio_jax.data.trajectory import ns_to_seconds
+from lio_jax.core.timestamps import ns_to_seconds
 
 T = TypeVar("T")
 

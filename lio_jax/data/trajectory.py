@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from lio_jax.core.errors import LioJaxError
+from lio_jax.core.timestamps import ns_to_seconds, seconds_to_ns
 
 
 @dataclass(frozen=True)
@@ -61,20 +62,6 @@ def pose_matrices(positions: NDArray[np.float64], quaternions: NDArray[np.float6
     poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
     poses[:, :3, 3] = positions
     return poses
-
-
-def seconds_to_ns(text: str) -> int:
-    """Convert decimal seconds to ns without passing through a float, which cannot hold epoch time to a ns."""
-    whole, _, fraction = text.partition(".")
-    if not fraction or not fraction.isdigit() or not whole.isdigit():
-        return round(float(text) * 1e9)
-    return int(whole) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
-
-
-def ns_to_seconds(stamp_ns: int) -> str:
-    """Write ns as decimal seconds with 9 decimals, exactly."""
-    sign, stamp = ("-", -stamp_ns) if stamp_ns < 0 else ("", stamp_ns)
-    return f"{sign}{stamp // 1_000_000_000}.{stamp % 1_000_000_000:09d}"
 
 
 def read_tum(path: Path) -> Trajectory:

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data.trajectory import Trajectory, ns_to_seconds
+from lio_jax.core.timestamps import ns_to_seconds
+from lio_jax.data.trajectory import Trajectory
 
 # Text files round stamps (KITTI's times.txt keeps 6 digits): this far outside the span is still its end.
 _SPAN_TOLERANCE_NS = 100_000

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data.trajectory import Trajectory, read_kitti_poses, read_tum, seconds_to_ns
+from lio_jax.core.timestamps import seconds_to_ns
+from lio_jax.data.trajectory import Trajectory, read_kitti_poses, read_tum
 
 _RUN_TRAJECTORY = "trajectory.tum"
 

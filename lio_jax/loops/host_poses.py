@@ -61,3 +61,8 @@ def nearest_rotations(matrix: _Array) -> _Array:
     left, _, right = np.linalg.svd(matrix)
     left[:, :, -1] *= np.sign(np.linalg.det(left @ right))[:, None]
     return left @ right
+
+
+def heading_of(pose: _Array) -> float:
+    """Return the direction of a (4, 4) pose's x axis in the plane, rad."""
+    return float(np.arctan2(pose[1, 0], pose[0, 0]))

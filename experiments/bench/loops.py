@@ -1,0 +1,268 @@
+"""Loops that are found, missed and wrong on simulated drives whose odometry drifts more than is usual.
+
+    python experiments/bench/loops.py [--only NAME ...] [--json]
+
+A keyframe is a revisit if it is within 10 m of one that is more than 30 s older; it is recalled if a loop
+from it enters the graph. A loop is false if it is wrong by more than 1 m or 0.05 rad. The graph is solved at
+every 20th keyframe where loops have entered since. Times are of a keyframe's loops alone, without the graph.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+if TYPE_CHECKING:
+    from lio_jax.loops.closing import LoopCloser
+    from lio_jax.loops.keyframe import Keyframe
+
+_REVISIT, _TIME_GAP = 10.0, 30.0
+_FALSE = (1.0, 0.05)
+_SOLVE_EVERY = 20
+_LOOP = [(-1, -1), (3, -1), (3, 1), (1, 1), (1, 3), (-1, 3)]
+"""Crossings of the blocks' grid where the loop of 1.1 km turns."""
+
+Drive = tuple["list[Keyframe]", np.ndarray]
+"""Keyframes and their true poses."""
+
+
+def main() -> None:
+    """Measure and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="drives; all without it")
+    parser.add_argument("--json", action="store_true", help="one JSON object on the last line")
+    options = parser.parse_args()
+    from lio_jax.commands.runtime import prepare_jax
+
+    prepare_jax()
+    print(
+        f"{'drive':28}{'metres':>8}{'drift m':>8}{'revisits':>9}{'recall':>8}{'loops':>7}{'false':>6}"
+        f"{'worst m':>8}{'worst rad':>10}{'ms':>7}{'p95':>7}"
+    )
+    rows = []
+    for name, make in _drives().items():
+        if options.only and name not in options.only:
+            continue
+        row = measured(*make())
+        rows.append({"drive": name} | row)
+        print(
+            f"{name:28}{row['metres']:8.0f}{row['drift_m']:8.1f}{row['revisits']:9d}{row['recall']:8.3f}"
+            f"{row['loops']:7d}{row['false']:6d}{row['worst_m']:8.2f}{row['worst_rad']:10.4f}"
+            f"{row['median_ms']:7.0f}{row['p95_ms']:7.0f}"
+        )
+        for reason, count in row["refused"].items():
+            print(f"{'':28}{count:6d} {reason}")
+    if options.json:
+        print(json.dumps({"rows": rows}))
+
+
+def measured(keyframes: "list[Keyframe]", truth: np.ndarray) -> dict[str, Any]:
+    """Return what the table shows of a drive."""
+    closer, seconds = closed(keyframes)
+    revisited = revisits(keyframes, truth)
+    loops = closer.closed
+    errors = np.array(
+        [error_of(loop.T_target_source, truth, loop.proposal.source, loop.proposal.target) for loop in loops]
+    ).reshape(-1, 2)
+    recalled = {loop.proposal.source for loop in loops} & set(revisited.tolist())
+    odometry = np.array([keyframe.T_odom_imu for keyframe in keyframes])
+    ran = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()
+    reasons: dict[str, int] = {}
+    for verdict in closer.outcomes():
+        if not verdict.accepted:
+            kind = " ".join(word for word in verdict.reason.split() if not any(c.isdigit() for c in word))
+            reasons[kind] = reasons.get(kind, 0) + 1
+    return {
+        "keyframes": len(keyframes),
+        "metres": float(ran),
+        "drift_m": float(np.linalg.norm(odometry[:, :3, 3] - truth[:, :3, 3], axis=1).max()),
+        "revisits": len(revisited),
+        "recall": len(recalled) / max(len(revisited), 1),
+        "loops": len(loops),
+        "false": int(np.sum((errors[:, 0] > _FALSE[0]) | (errors[:, 1] > _FALSE[1]))),
+        "worst_m": float(errors[:, 0].max(initial=0.0)),
+        "worst_rad": float(errors[:, 1].max(initial=0.0)),
+        "median_ms": float(np.median(seconds) * 1e3),
+        "p95_ms": float(np.percentile(seconds, 95) * 1e3),
+        "refused": reasons,
+    }
+
+
+def closed(keyframes: "list[Keyframe]") -> "tuple[LoopCloser, np.ndarray]":
+    """Return the loops of a drive, its poses being corrected on the way, and each keyframe's s."""
+    from lio_jax.core.settings import Settings
+    from lio_jax.loops.closing import LoopCloser
+
+    closer = LoopCloser(Settings())
+    poses = np.zeros((0, 4, 4))
+    seconds, news = [], False
+    for number, keyframe in enumerate(keyframes, 1):
+        step = keyframe.T_odom_imu
+        if number > 1:
+            step = poses[-1] @ np.linalg.inv(keyframes[number - 2].T_odom_imu) @ keyframe.T_odom_imu
+        poses = np.concatenate([poses, step[None]])
+        begin = time.perf_counter()
+        news |= bool(closer.take(keyframes[:number], poses))
+        seconds.append(time.perf_counter() - begin)
+        if news and number % _SOLVE_EVERY == 0:
+            poses, news = corrected(keyframes[:number], closer), False
+    return closer, np.array(seconds)
+
+
+def corrected(keyframes: "list[Keyframe]", closer: "LoopCloser") -> np.ndarray:
+    """Return the keyframes' poses that agree best with odometry and loops, (k, 4, 4)."""
+    import jax.numpy as jnp
+
+    from lio_jax.loops.graduated import Robust
+    from lio_jax.loops.graph import LOOP, ODOMETRY, PoseGraph
+    from lio_jax.loops.host_poses import poses_from, rotation_matrices, translations
+    from lio_jax.loops.pose_graph import solve
+
+    odometry = np.array([keyframe.T_odom_imu for keyframe in keyframes])
+    steps = np.linalg.inv(odometry[:-1]) @ odometry[1:]
+    loops = closer.closed
+    measurement = np.concatenate([steps, [loop.T_target_source for loop in loops]])
+    first = np.arange(len(steps))
+    ends = np.array([(loop.proposal.target, loop.proposal.source) for loop in loops])
+    information = [np.linalg.inv(keyframe.covariance) for keyframe in keyframes[1:]]
+    graph = PoseGraph(
+        poses_from(odometry[:, :3, :3], odometry[:, :3, 3]),
+        jnp.asarray(np.concatenate([first, ends[:, 0]])),
+        jnp.asarray(np.concatenate([first + 1, ends[:, 1]])),
+        poses_from(measurement[:, :3, :3], measurement[:, :3, 3]),
+        jnp.asarray(np.concatenate([information, [loop.information for loop in loops]])),
+        jnp.asarray(np.repeat([ODOMETRY, LOOP], [len(steps), len(loops)])),
+        jnp.arange(len(keyframes)) == 0,
+    )
+    solution = solve(graph, robust=Robust())
+    poses = np.tile(np.eye(4), (len(keyframes), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rotation_matrices(solution.poses), translations(solution.poses)
+    return poses
+
+
+def revisits(keyframes: "list[Keyframe]", truth: np.ndarray) -> np.ndarray:
+    """Return the keyframes that are near a much older one."""
+    stamps = np.array([keyframe.stamp_ns for keyframe in keyframes])
+    found = []
+    for index, stamp in enumerate(stamps):
+        apart = np.linalg.norm(truth[:index, :3, 3] - truth[index, :3, 3], axis=1)
+        if np.any((apart < _REVISIT) & (stamp - stamps[:index] > _TIME_GAP * 1e9)):
+            found.append(index)
+    return np.array(found, np.int64)
+
+
+def error_of(T_target_source: np.ndarray, truth: np.ndarray, source: int, target: int) -> tuple[float, float]:
+    """Return by how much a relative pose is wrong, m and rad."""
+    wrong = np.linalg.inv(np.linalg.inv(truth[target]) @ truth[source]) @ T_target_source
+    angle = np.arccos(np.clip((np.trace(wrong[:3, :3]) - 1) / 2, -1, 1))
+    return float(np.linalg.norm(wrong[:3, 3])), float(angle)
+
+
+def _drives() -> dict[str, Callable[[], Drive]]:
+    return {
+        "city, again": lambda: town("city", 0, again=1.0),
+        "city, other lane, opposite": lambda: town("city", 1, again=-1.0),
+        "city, 3 m aside": lambda: town("city", 2, again=1.0, aside=3.0),
+        "street, again": lambda: town("street", 0, again=1.0),
+        "tunnel, there and back": tunnel,
+        "blocks all alike": alike,
+    }
+
+
+def town(
+    name: str,
+    seed: int,
+    again: float,
+    aside: float = 0.0,
+    loop: Any = None,
+    spacing: float = 1.0,
+    speed: float = 8.0,
+) -> Drive:
+    """Return a drive around a loop twice, in the right lane.
+
+    Args:
+        name: of the world.
+        seed: of the world.
+        again: 1: the second time in the same direction; -1: in the opposite one.
+        aside: the second time so much farther to the left, m.
+        loop: crossings of the grid of blocks where it turns, counterclockwise; None: 1.1 km.
+        spacing: of the keyframes, m.
+        speed: m/s.
+    """
+    from simulated_keyframes import drifted, driven, keyframes_of, rounded, times_along
+
+    from lio_jax.sim.blocks import LANE, PITCH
+    from lio_jax.sim.blocks import lap as lap_of
+    from lio_jax.sim.world_registry import build
+
+    world = build(name, seed).world
+    # the world's origin is where its own route begins
+    path = rounded(np.array(loop or _LOOP) * PITCH - lap_of()[0], spacing=spacing)
+    first = driven(world, path, -LANE)
+    second = driven(world, path if again > 0 else path[::-1], aside - LANE)
+    truth = np.concatenate([first, second])
+    odometry = drifted(truth, scale=0.01, heading=1.2e-4, noise=0.02, seed=seed)
+    return keyframes_of(world, truth, odometry, times_along(truth, speed), seed=seed), truth
+
+
+def tunnel() -> Drive:
+    """Return a drive through a smooth tunnel, and back in the same lane."""
+    from simulated_keyframes import drifted, driven, keyframes_of
+
+    from lio_jax.sim.world_registry import build
+
+    world = build("tunnel", 0).world
+    there = np.stack([np.arange(0.0, 660.0), np.zeros(660)], axis=1)
+    truth = np.concatenate([driven(world, there, above=3.0), driven(world, there[::-1], above=3.0)])
+    odometry = drifted(truth, scale=0.02, heading=0.0, noise=0.02)
+    return keyframes_of(world, truth, odometry, times_along(truth)), truth
+
+
+def alike(length: float = 700.0, spacing: float = 1.0) -> Drive:
+    """Return a drive out along a street and back along the next one, in a town whose blocks are all the same.
+
+    No place is seen twice.
+    """
+    from simulated_keyframes import drifted, driven, keyframes_of, rounded, times_along
+
+    pitch = 60.0
+    world = town_of_equal_blocks(pitch, int(length / pitch) + 4, 4)
+    around = rounded([(0, 0), (length, 0), (length, pitch), (0, pitch)], spacing=spacing)
+    # as far as the corner where the first street would be reached again
+    path = around[(around[:, 0] > 10) | (np.arange(len(around)) > 20)][: int((2 * length + 20) / spacing)]
+    truth = driven(world, path, above=3.0)
+    odometry = drifted(truth, scale=-0.02, heading=0.0, noise=0.02)
+    return keyframes_of(world, truth, odometry, times_along(truth)), truth
+
+
+def town_of_equal_blocks(pitch: float, columns: int, rows: int) -> Any:
+    """Return a grid of streets whose blocks, so many m long and wide, repeat each other exactly."""
+    from lio_jax.sim.assembly import assembled, draws, upright
+
+    rng = np.random.default_rng(4)
+    houses = 16
+    place = rng.uniform(8.0, pitch - 8.0, (houses, 2))
+    # along the four sides, for the streets to see them
+    place[np.arange(houses), np.arange(houses) % 2] = np.where(np.arange(houses) % 4 < 2, 9.0, pitch - 9.0)
+    width, depth, height = draws(rng, houses, (1.0, 4.0), (1.0, 4.0), (2.0, 9.0))
+    half = np.stack([width / 2, depth / 2, height / 2], axis=1)
+    center = np.column_stack([place, height / 2])
+    block = upright(center - half, center + half, 0.4)
+    shifts = [
+        (column * pitch, row * pitch) for column in range(-2, columns - 2) for row in range(-2, rows - 1)
+    ]
+    boxes = np.concatenate([block + np.array([x, y, 0, 0, 0, 0, 0, 0]) for x, y in shifts])
+    return assembled([0.0, 0.0, 0.0], planes=[[0, 0, 0, 0, 0, 1, 0.2]], boxes=boxes)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,124 @@
+"""Align the points of one place with those of another from several first guesses, on the device."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float32
+from numpy.typing import NDArray
+
+from lio_jax.core.params import Params
+from lio_jax.loops.host_poses import poses_from, rotation_matrices
+from lio_jax.mapping.voxel_map import VoxelMap, empty_map, insert
+from lio_jax.registration.gauss_newton import CONVERGED, Registration
+from lio_jax.registration.scan_to_map import register
+
+_CAPACITY = 65536
+"""Voxels of the map that points are aligned with."""
+_COARSE = 2.0
+"""The first map's voxels are so many times larger ..."""
+_COARSE_ERROR, _FINE_ERROR = 1.5, 0.5
+"""... as the guesses and the first result may be wrong by about this, m: it opens the robust kernel."""
+_ITERATIONS = 30
+_REACH = 1e5
+"""No voxel is farther than this from the target, m: none is forgotten."""
+
+
+class Alignments(NamedTuple):
+    """What each guess led to."""
+
+    T_target_source: NDArray[np.float64]
+    """(n, 4, 4)."""
+    information: NDArray[np.float64]
+    """(n, 6, 6) inverse covariance of the right perturbation, rotation first; all points independent."""
+    degenerate: NDArray[np.bool_]
+    """(n,) whether the points leave a direction open."""
+    converged: NDArray[np.bool_]
+    """(n,)."""
+
+
+def aligned(
+    target: NDArray[np.float32],
+    target_mask: NDArray[np.bool_],
+    source: NDArray[np.float32],
+    source_mask: NDArray[np.bool_],
+    guesses: NDArray[np.float64],
+    most: int,
+    params: Params,
+) -> Alignments:
+    """Return the alignments from some guesses.
+
+    Args:
+        target: (m, 3) m, padded to a size that is always the same.
+        target_mask: (m,) which rows are real.
+        source: (k, 3) m, padded likewise.
+        source_mask: (k,).
+        guesses: (n, 4, 4) T_target_source, at most ``most``.
+        most: number of guesses that the program is compiled for.
+        params: ``params.map.voxel_size`` is that of the final map.
+    """
+    count = len(guesses)
+    padded = np.concatenate([guesses, np.repeat(guesses[:1], most - count, axis=0)])
+    starts = poses_from(padded[:, :3, :3], padded[:, :3, 3])
+    result = _aligned(target, target_mask, source, source_mask, starts, jnp.int32(count), params)
+    T, information, degenerate, status = jax.device_get(
+        (result.T_world_lidar.wxyz_xyz, result.information, result.degenerate, result.status)
+    )
+    found = np.tile(np.eye(4), (count, 1, 1))
+    found[:, :3, :3] = rotation_matrices(jaxlie.SE3(T[:count]))
+    found[:, :3, 3] = T[:count, 4:]
+    return Alignments(found, information[:count], degenerate[:count].any(axis=1), status[:count] == CONVERGED)
+
+
+class _Still(eqx.Module):
+    """Points that need no compensation."""
+
+    points: Float32[Array, "k 3"]
+
+    def __call__(self, T_world_lidar: jaxlie.SE3) -> Float32[Array, "k 3"]:
+        return self.points
+
+
+@jax.jit
+def _aligned(
+    target: Float32[Array, "m 3"],
+    target_mask: Bool[Array, " m"],
+    source: Float32[Array, "k 3"],
+    source_mask: Bool[Array, " k"],
+    starts: jaxlie.SE3,
+    count: Array,
+    params: Params,
+) -> Registration:
+    def stage(starts: jaxlie.SE3, voxel_size: Float[Array, ""], error: float) -> Registration:
+        sized = eqx.tree_at(lambda params: params.map.voxel_size, params, voxel_size)
+        vmap = _map_of(target, target_mask, voxel_size)
+        dtype = starts.wxyz_xyz.dtype
+
+        def one(case: tuple[Array, Array]) -> Registration:
+            number, start = case
+            # guesses that only fill up cost nothing
+            mask = source_mask & (number < count)
+            return register(
+                vmap, _Still(source), mask, jaxlie.SE3(start), jnp.asarray(error, dtype), sized, _ITERATIONS
+            )
+
+        # one after the other: each stops where it has converged
+        return jax.lax.map(one, (jnp.arange(len(starts.wxyz_xyz)), starts.wxyz_xyz))
+
+    first = stage(starts, _COARSE * params.map.voxel_size, _COARSE_ERROR)
+    return stage(first.T_world_lidar, params.map.voxel_size, _FINE_ERROR)
+
+
+def _map_of(points: Float32[Array, "m 3"], mask: Bool[Array, " m"], voxel_size: Float[Array, ""]) -> VoxelMap:
+    vmap, _ = insert(
+        empty_map(_CAPACITY),
+        points,
+        mask,
+        jnp.zeros(3, jnp.int32),
+        voxel_size.astype(jnp.float32),
+        jnp.float32(_REACH),
+    )
+    return vmap

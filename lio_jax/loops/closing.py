@@ -1,0 +1,146 @@
+"""Close loops one keyframe after the other."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.settings import Settings
+from lio_jax.loops.consistency import Consensus, consistent
+from lio_jax.loops.drift import AT_LEAST, metres_from
+from lio_jax.loops.external_pairs import Pair, keyframe_at, read_pairs
+from lio_jax.loops.keyframe import Keyframe
+from lio_jax.loops.place_descriptor import Places
+from lio_jax.loops.proposals import (
+    Proposal,
+    described_proposals,
+    external_proposal,
+    is_old,
+    nearest_proposal,
+)
+from lio_jax.loops.verification import Verdict, verify
+
+_AMBIGUOUS = "another place fits as well"
+_SAME = "another comparison of this keyframe says the same with more points"
+_UNCONFIRMED = "no other loop nearby confirms it"
+
+
+class LoopCloser:
+    """What is known of loops so far.
+
+    For each keyframe call :meth:`take`; or :meth:`proposals_for`, ``verify`` and :meth:`settle`, which it is
+    made of.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        """Begin with no keyframe.
+
+        Args:
+            settings: ``config.loops`` and ``params.loop``.
+
+        Raises:
+            LioJaxError: the file of pairs cannot be read or holds something else.
+        """
+        sizes, limits = settings.config.loops, settings.values["loop"]
+        self._settings, self._limits = settings, limits
+        self._places = Places(sizes.rings, sizes.sectors, limits["descriptor_range"])
+        self._consensus = Consensus(limits)
+        self._pairs = read_pairs(Path(sizes.pairs)) if sizes.pairs else []
+        self._run: list[float] = []
+        """What the odometry has run up to each keyframe, m."""
+        self._refused: list[Verdict] = []
+        self._without_keyframes: list[Pair] = []
+
+    @property
+    def closed(self) -> list[Verdict]:
+        """Return the loops that are in the graph, in the order in which they entered."""
+        return list(self._consensus.entered)
+
+    def take(self, keyframes: Sequence[Keyframe], poses: NDArray[np.float64]) -> list[Verdict]:
+        """Take up the newest keyframe; return the loops that enter the graph now.
+
+        Args:
+            keyframes: all so far; each call brings one more.
+            poses: (k, 4, 4) their T_world_imu, corrected so far.
+        """
+        proposals = self.proposals_for(keyframes, poses)
+        verdicts = [verify(proposal, keyframes, poses, self._settings) for proposal in proposals]
+        return self.settle(verdicts, keyframes)
+
+    def proposals_for(self, keyframes: Sequence[Keyframe], poses: NDArray[np.float64]) -> list[Proposal]:
+        """Return what the newest keyframe is to be compared with. To be called once for each."""
+        self._places.add(keyframes[-1])
+        step = keyframes[-1].T_odom_imu[:3, 3] - keyframes[-2 if len(keyframes) > 1 else -1].T_odom_imu[:3, 3]
+        self._run.append(self._run[-1] + float(np.linalg.norm(step)) if self._run else 0.0)
+        run = np.array(self._run)
+        ends = held_by(poses, self._consensus.entered)
+        metres = metres_from(len(keyframes) - 1, run, ends)
+        old = is_old(keyframes, len(keyframes) - 1, self._limits["time_gap"])
+        proposals = nearest_proposal(poses, old, metres, self._limits)
+        proposals += described_proposals(self._places, poses, old, metres, self._limits)
+        while self._pairs and self._pairs[0].later_ns <= keyframes[-1].stamp_ns:
+            proposals += self._from_outside(self._pairs.pop(0), keyframes, poses, run, ends)
+        return proposals
+
+    def settle(self, verdicts: Sequence[Verdict], keyframes: Sequence[Keyframe]) -> list[Verdict]:
+        """Take up the verdicts on the newest proposals; return the loops that enter the graph now."""
+        run = np.array(self._run)
+        self._refused += [verdict for verdict in verdicts if not verdict.accepted]
+        accepted = [verdict for verdict in verdicts if verdict.accepted]
+        entering = []
+        for verdict in accepted:
+            if verdict.proposal.origin == "external":
+                entering += self._consensus.with_loop(verdict, keyframes, run)
+        own = [verdict for verdict in accepted if verdict.proposal.origin != "external"]
+        own.sort(key=lambda verdict: -verdict.overlap)
+        if all(consistent(own[0], other, keyframes, run, self._limits) for other in own[1:]):
+            for verdict in own[:1]:
+                entering += self._consensus.with_loop(verdict, keyframes, run)
+            self._refused += [replace(verdict, accepted=False, reason=_SAME) for verdict in own[1:]]
+        else:
+            self._refused += [replace(verdict, accepted=False, reason=_AMBIGUOUS) for verdict in own]
+        return entering
+
+    def _from_outside(
+        self,
+        pair: Pair,
+        keyframes: Sequence[Keyframe],
+        poses: NDArray[np.float64],
+        run: NDArray[np.float64],
+        ends: Sequence[tuple[int, int]],
+    ) -> list[Proposal]:
+        source, target = (keyframe_at(keyframes, stamp) for stamp in (pair.later_ns, pair.earlier_ns))
+        if source is None or target is None or source == target:
+            self._without_keyframes.append(pair)
+            return []
+        metres = float(metres_from(source, run, ends)[target])
+        return [external_proposal(source, target, pair.T_earlier_later, poses, metres, self._limits)]
+
+    def outcomes(self) -> list[Verdict]:
+        """Return every proposal so far with what became of it, by its newer keyframe."""
+        waiting = [replace(loop, accepted=False, reason=_UNCONFIRMED) for loop in self._consensus.waiting]
+        every = [*self._consensus.entered, *waiting, *self._refused]
+        return sorted(every, key=lambda verdict: verdict.proposal.source)
+
+    def untried(self) -> list[Pair]:
+        """Return pairs from outside that belong to no two keyframes so far."""
+        return [*self._without_keyframes, *self._pairs]
+
+
+def held_by(poses: NDArray[np.float64], loops: Sequence[Verdict]) -> list[tuple[int, int]]:
+    """Return the ends of the loops that poses agree with: neither ignored so far nor distrusted by the graph.
+
+    Args:
+        poses: (k, 4, 4) T_world_imu.
+        loops: that entered the graph.
+    """
+    if not loops:
+        return []
+    ends = np.array([(loop.proposal.source, loop.proposal.target) for loop in loops])
+    measured = np.array([loop.T_target_source for loop in loops])
+    wrong = np.linalg.inv(poses[ends[:, 0]]) @ poses[ends[:, 1]] @ measured
+    turned = np.arccos(np.clip((np.trace(wrong[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
+    moved = np.linalg.norm(wrong[:, :3, 3], axis=1)
+    return [(int(a), int(b)) for a, b in ends[(moved < AT_LEAST.position) & (turned < AT_LEAST.heading)]]
