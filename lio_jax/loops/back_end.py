@@ -1,29 +1,32 @@
 """Correct the drift of an odometry: keyframes in, one by one, and one consistent trajectory out.
 
-The block diagram of LIO-SAM's map optimisation (Shan et al., "LIO-SAM: Tightly-coupled lidar inertial odometry
-via smoothing and mapping", IROS 2020, III-D and III-E): odometry between keyframes, loops, GPS, pose graph.
-What becomes of a keyframe depends on those before it alone, never on the clock.
+The block diagram of LIO-SAM's map optimisation (Shan et al., "LIO-SAM: tightly-coupled lidar inertial
+odometry via smoothing and mapping", IROS 2020, III-D and III-E): odometry, loops, GPS, pose graph.
+What becomes of a keyframe depends on those up to it alone, never on the clock.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lio_jax.core.pose_covariance import carried
 from lio_jax.core.settings import Settings
+from lio_jax.loops.closing import LoopCloser, held_by
 from lio_jax.loops.drift_correction import levelled_onto
-from lio_jax.loops.gps import Fix, FixChooser, alignment
+from lio_jax.loops.gps import Fix, GpsGate, Refusal
+from lio_jax.loops.gps_alignment import alignment
 from lio_jax.loops.graph import LOOP, ODOMETRY, POSITION, PRIOR
 from lio_jax.loops.keyframe import Keyframe
-from lio_jax.loops.keyframe_graph import Edge, solved
-from lio_jax.loops.place_recogniser import PlaceRecogniser
+from lio_jax.loops.keyframe_graph import Edge, Solved, solved
 from lio_jax.loops.verification import Verdict
 
 _Array = NDArray[np.float64]
 
 _SOLVE_EVERY = 20
-"""Keyframes from one solve to the next, while loops or fixes come in and agree with the poses."""
+"""Keyframes from one solve to the next, while loops and fixes come in that agree with the poses."""
+_UNKNOWN_YAW, _UNKNOWN_POSITION = np.pi, 1e4
+"""Sigmas of the first pose on the earth, rad and m, as in LIO-SAM; fixes tell both."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,83 +38,170 @@ class Correction:
     T_odom_imu: _Array
     """(k, 4, 4) by the odometry."""
     T_world_imu: _Array
-    """(k, 4, 4) corrected, in a z-up world where the first keyframe has the odometry's position and heading."""
+    """(k, 4, 4) corrected, in a z-up world in which the first keyframe keeps its position and heading."""
     edges: list[Edge]
     weights: _Array
     """(e,) of the edges: 1, or below where one contradicts the others."""
-    verdicts: list[Verdict]
-    """Of all proposed loops, in the order of proposal."""
+    loops: list[tuple[Verdict, float | None]]
+    """Every proposed loop and, of those that entered the graph, the weight."""
     fixes: dict[str, int]
-    """How many GPS fixes were used or refused, by reason."""
+    """How many keyframes were tied to a GPS fix, and how many were not, by reason."""
     T_enu_world: _Array | None
-    """(4, 4) from world to east-north-up about the recording's origin; None without GPS."""
+    """(4, 4) from world to the fixes' east-north-up frame; None without fixes, or too few for the heading."""
 
 
 class BackEnd:
     """Takes keyframes in order."""
 
-    def __init__(self, settings: Settings, recogniser: PlaceRecogniser | None, fixes: FixChooser | None):
+    def __init__(self, settings: Settings, closer: LoopCloser | None, gate: GpsGate | None) -> None:
         """Begin without keyframes.
 
         Args:
-            settings: sigmas of ``params.backend``.
-            recogniser: of places seen before; None: no loops are closed.
-            fixes: of the recording's GPS; None: it is not used.
+            settings: ``params.backend`` and ``params.gps``.
+            closer: finds loops; None: none are closed.
+            gate: chooses GPS fixes; None: they are not used.
         """
-        sigmas = settings.values["backend"]
-        self._first_tilt_sigma: float = sigmas["tilt_sigma"]
-        self._recogniser, self._fixes = recogniser, fixes
+        self._tilt_sigma: float = settings.values["backend"]["tilt_sigma"]
+        self._lever = np.asarray(settings.values["gps"]["lever_arm"], np.float64)
+        self._yaw_sigma: float = settings.values["gps"]["yaw_sigma"]
+        self._closer, self._gate = closer, gate
         self._keyframes: list[Keyframe] = []
         self._poses = np.zeros((0, 4, 4))
+        """In the odometry's world; from the alignment on in the fixes' frame."""
         self._edges: list[Edge] = []
-        self._positions: list[tuple[int, Fix]] = []
-        self._verdicts: list[Verdict] = []
-        self._T_enu_odom: _Array | None = None
-        self._unsolved_since: int | None = None
+        self._fixes: list[tuple[int, Fix]] = []
+        self._aligned = False
+        self._since_fix = np.zeros((6, 6))
+        """Covariance of the last pose, given the last fix."""
+        self._weights = np.zeros(0)
+        self._unsolved = 0
+        """Loops and fixes that entered the graph since it was solved."""
+        self._solved_at = 0
 
     def add(self, keyframe: Keyframe) -> None:
-        """Take the next keyframe; its loops and fix enter the graph, which is solved where it is due."""
+        """Take the next keyframe; its loops and its fix enter the graph, which is solved where it is due."""
         self._append(keyframe)
-        if self._recogniser:
-            self._close_loops(self._recogniser)
-        if self._fixes:
-            self._fix(self._fixes)
-        if self._due():
+        surprised = self._close_loops(self._closer) if self._closer else False
+        surprised |= self._tie_to_earth(self._gate) if self._gate else False
+        if surprised or (self._unsolved and len(self._keyframes) >= self._solved_at + _SOLVE_EVERY):
             self._solve()
 
+    def settle(self) -> None:
+        """Solve the graph with all that it holds."""
+        if self._unsolved:
+            self._solve()
+
+    def correction(self) -> Correction:
+        """Return the correction of all keyframes so far, as the last solve left it."""
+        T_world = np.eye(4)
+        if self._keyframes and self._aligned:
+            T_world = levelled_onto(self._poses[0], self._keyframes[0].T_odom_imu)
+        weights = np.ones(len(self._edges))
+        weights[: len(self._weights)] = self._weights
+        fixes: dict[str, int] = {}
+        if self._gate:
+            fixes = {"used": len(self._fixes)} | {str(why): n for why, n in self._gate.refusals.items()}
+        return Correction(
+            stamp_ns=np.array([keyframe.stamp_ns for keyframe in self._keyframes], np.int64),
+            T_odom_imu=np.array([keyframe.T_odom_imu for keyframe in self._keyframes]).reshape(-1, 4, 4),
+            T_world_imu=T_world @ self._poses,
+            edges=self._edges,
+            weights=weights,
+            loops=self._outcomes(weights),
+            fixes=fixes,
+            T_enu_world=_inverse(T_world) if self._aligned else None,
+        )
+
     def _append(self, keyframe: Keyframe) -> None:
+        pose = keyframe.T_odom_imu
         if self._keyframes:
             last = self._keyframes[-1]
-            T_last_this = np.linalg.inv(last.T_odom_imu) @ keyframe.T_odom_imu
-            information = np.linalg.inv(keyframe.covariance)
+            T_last_this = _inverse(last.T_odom_imu) @ pose
+            information = _inverse(keyframe.covariance)
             self._edges.append(Edge(ODOMETRY, last.index, keyframe.index, T_last_this, information))
             pose = self._poses[-1] @ T_last_this
-        else:
-            pose = keyframe.T_odom_imu
+            self._since_fix = carried(self._since_fix, _inverse(T_last_this)) + keyframe.covariance
         self._keyframes.append(keyframe)
         self._poses = np.concatenate([self._poses, pose[None]])
 
-    def _close_loops(self, recogniser: PlaceRecogniser) -> None:
-        verdicts = recogniser.loops_at(self._keyframes, self._poses)
-        self._verdicts += verdicts
-        for verdict in verdicts:
-            if verdict.accepted:
-                of = verdict.proposal
-                self._edges.append(
-                    Edge(LOOP, of.target, of.source, verdict.T_target_source, verdict.information)
-                )
-                self._waits()
+    def _close_loops(self, closer: LoopCloser) -> bool:
+        """Add the loops that are found now; return whether one contradicts the poses."""
+        entering = closer.take(self._keyframes, self._poses)
+        for verdict in entering:
+            ends = verdict.proposal.target, verdict.proposal.source
+            self._edges.append(Edge(LOOP, *ends, verdict.T_target_source, verdict.information))
+        self._unsolved += len(entering)
+        return len(held_by(self._poses, entering)) < len(entering)
 
-    def _fix(self, fixes: FixChooser) -> None:
-        fix = fixes.used_fix(self._keyframes[-1], self._poses)
-        if fix is None:
-            return
-        self._positions.append((self._keyframes[-1].index, fix))
-        if self._T_enu_odom is not None:
-            self._waits()
-            return
-        aligned = alignment(...)
-        if aligned is not None:
-            self._T_enu_odom = aligned.T_enu_odom
-            self._poses = self._T_enu_odom @ self._poses
-            self._waits()
+    def _tie_to_earth(self, gate: GpsGate) -> bool:
+        """Add the newest keyframe's fix; return whether it is the one from which on the heading is known."""
+        keyframe, pose = self._keyframes[-1], self._poses[-1]
+        covariance = pose[:3, :3] @ self._since_fix[3:, 3:] @ pose[:3, :3].T if self._aligned else None
+        fix = gate.used_fix(keyframe.stamp_ns, keyframe.T_odom_imu, pose, covariance)
+        if isinstance(fix, Refusal):
+            return False
+        self._since_fix = np.zeros((6, 6))
+        self._fixes.append((keyframe.index, fix))
+        if self._aligned:
+            self._edges.append(_position(keyframe.index, fix, self._lever))
+            self._unsolved += 1
+            return False
+        return self._align()
+
+    def _align(self) -> bool:
+        """Lay the poses into the fixes' frame, where these tell the heading already."""
+        poses = self._poses[[index for index, _ in self._fixes]]
+        antennas = poses[:, :3, :3] @ self._lever + poses[:, :3, 3]
+        positions = np.array([fix.position for _, fix in self._fixes])
+        covariances = np.array([fix.covariance for _, fix in self._fixes])
+        found = alignment(antennas, positions, covariances, self._yaw_sigma)
+        if found is None:
+            return False
+        self._poses = found.T_enu_odom @ self._poses
+        self._edges.append(_first_pose(self._poses[0], self._tilt_sigma))
+        self._edges += [_position(index, fix, self._lever) for index, fix in self._fixes]
+        self._aligned = True
+        self._unsolved += len(self._fixes)
+        return True
+
+    def _solve(self) -> None:
+        found: Solved = solved(self._poses, self._edges)
+        self._poses, self._weights = found.poses, found.weights
+        self._unsolved, self._solved_at = 0, len(self._keyframes)
+
+    def _outcomes(self, weights: _Array) -> list[tuple[Verdict, float | None]]:
+        if self._closer is None:
+            return []
+        weight_of = {
+            (edge.i, edge.j): float(weight)
+            for edge, weight in zip(self._edges, weights, strict=True)
+            if edge.kind == LOOP
+        }
+        return [
+            (
+                verdict,
+                weight_of.get((verdict.proposal.target, verdict.proposal.source))
+                if verdict.accepted
+                else None,
+            )
+            for verdict in self._closer.outcomes()
+        ]
+
+
+def _position(index: int, fix: Fix, lever: _Array) -> Edge:
+    measured, information = np.eye(4), np.zeros((6, 6))
+    measured[:3, 3] = fix.position
+    information[3:, 3:] = _inverse(fix.covariance)
+    return Edge(POSITION, index, index, measured, information, lever)
+
+
+def _first_pose(T_enu_imu: _Array, tilt_sigma: float) -> Edge:
+    """Return the prior without which fixes along a straight way would leave the roll about it open."""
+    information = np.diag([tilt_sigma**-2] * 2 + [_UNKNOWN_YAW**-2] + [_UNKNOWN_POSITION**-2] * 3)
+    R = T_enu_imu[:3, :3]
+    information[:3, :3] = R.T @ information[:3, :3] @ R
+    return Edge(PRIOR, 0, 0, T_enu_imu, information)
+
+
+def _inverse(matrix: _Array) -> _Array:
+    return np.asarray(np.linalg.inv(matrix), np.float64)

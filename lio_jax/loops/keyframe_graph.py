@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from lio_jax.loops.graduated import Robust
-from lio_jax.loops.graph import LOOP, ODOMETRY, POSITION, PRIOR, PoseGraph, Poses
+from lio_jax.loops.graph import LOOP, POSITION, PoseGraph, Poses
 from lio_jax.loops.host_poses import matrices_of, poses_from
 from lio_jax.loops.pose_graph import solve
 
@@ -70,6 +70,7 @@ def solved(poses: _Array, edges: list[Edge]) -> Solved:
 def graph_of(poses: _Array, edges: list[Edge]) -> PoseGraph:
     """Return the pose graph of (k, 4, 4) poses and the edges between them."""
     measured = np.array([edge.measured for edge in edges]).reshape(-1, 4, 4)
+    levers = np.array([np.zeros(3) if edge.lever is None else edge.lever for edge in edges]).reshape(-1, 3)
     return PoseGraph(
         poses=_se3(poses),
         i=jax.device_put(np.array([edge.i for edge in edges], np.int64)),
@@ -78,6 +79,7 @@ def graph_of(poses: _Array, edges: list[Edge]) -> PoseGraph:
         information=jax.device_put(np.array([edge.information for edge in edges]).reshape(-1, 6, 6)),
         kind=jax.device_put(np.array([edge.kind for edge in edges], np.int64)),
         fixed=jax.device_put(np.zeros(len(poses), bool)),
+        lever=jax.device_put(levers),
     )
 
 

@@ -14,6 +14,9 @@ from lio_jax.run.map_file import SPOOL_SUFFIX
 RUN_FILES = (
     "trajectory.tum",
     "trajectory_kitti.txt",
+    "odometry.tum",
+    "loops.json",
+    "georeference.json",
     "imu_rate.tum",
     "states.npz",
     "scans.npz",

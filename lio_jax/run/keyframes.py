@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from lio_jax.core.pose_covariance import carried
 from lio_jax.core.settings import Settings
 from lio_jax.loops.g2o import Edge
 from lio_jax.loops.keyframe import Keyframe
-from lio_jax.run.covariance import carried
 from lio_jax.run.track import Tracked
 
 _LOOSE = np.diag([1e-2] * 3 + [1.0] * 3)
@@ -23,6 +23,8 @@ class KeyframePicker:
         self._covariance = np.diag([rotation**2] * 3 + [translation**2] * 3)
         self._last: Keyframe | None = None
         self._failed = False
+        self.stamps_ns: list[int] = []
+        """Of the keyframes so far."""
 
     def __call__(self, tracked: Tracked) -> Keyframe | None:
         """Return the scan as a keyframe, or None where it is none.
@@ -44,6 +46,7 @@ class KeyframePicker:
             covariance=_LOOSE if self._failed else self._covariance,
         )
         self._failed = False
+        self.stamps_ns.append(tracked.stamp_ns)
         return self._last
 
 
@@ -57,10 +60,14 @@ def points_in_imu(tracked: Tracked) -> NDArray[np.float32]:
     return from_imu @ T[:3, :3].astype(np.float32)
 
 
-def is_keyframe(
-    T_last: NDArray[np.float64], T: NDArray[np.float64], distance: float, angle: float
-) -> bool:
-    """Tell whether a (4, 4) pose moved further than ``distance`` (m) or turned by more than ``angle`` (rad)."""
+def corner_marks(tracked: Tracked) -> NDArray[np.bool_] | None:
+    """Return which of :func:`points_in_imu` are corners, (n,); None where the recipe does not tell."""
+    output = tracked.output
+    return None if output.corners is None else np.asarray(output.corners)[np.asarray(output.points_mask)]
+
+
+def is_keyframe(T_last: NDArray[np.float64], T: NDArray[np.float64], distance: float, angle: float) -> bool:
+    """Tell whether a (4, 4) pose is further than ``distance`` (m) or ``angle`` (rad) from the last one."""
     moved = np.linalg.inv(T_last) @ T
     turned = np.arccos(np.clip((np.trace(moved[:3, :3]) - 1) / 2, -1.0, 1.0))
     return bool(np.linalg.norm(moved[:3, 3]) > distance or turned > angle)

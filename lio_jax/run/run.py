@@ -23,6 +23,7 @@ from lio_jax.data.trajectory import Trajectory, write_kitti_poses, write_tum
 from lio_jax.loops.g2o import write_g2o
 from lio_jax.run.environment import environment
 from lio_jax.run.folder import write_json, write_text
+from lio_jax.run.global_correction import GlobalCorrection
 from lio_jax.run.imu_feed import OFFSET_MARGIN_S, ImuFeed
 from lio_jax.run.imu_rate import write_imu_rate
 from lio_jax.run.keyframes import keyframe_indices, odometry_edges
@@ -48,13 +49,13 @@ class RunResult:
     """What a run computed."""
 
     trajectory: Trajectory
-    """T_world_imu at the scans' ends."""
+    """T_world_imu at the scans' ends, corrected where there is a back end."""
     metrics: dict[str, Any]
     """What metrics.json holds."""
     stage_ms: dict[str, list[float]]
     """Time of each stage for each scan."""
-    map_points: NDArray[np.float32] | None
-    """(n, 3) m in world; None where no map was asked for."""
+    odometry: Trajectory | None
+    """As it was before the back end corrected it; None without one."""
     interruption: BaseException | None = None
     """What ended the run early, where something did."""
     notes: list[str] = field(default_factory=list)
@@ -116,7 +117,9 @@ def run_sequence(
     failures: list[dict[str, Any]] = []
     overflow = Overflow(settings)
     interruption: BaseException | None = None
-    map_file = MapFile(out / "map.pcd") if settings.config.output.map else None
+    backend = settings.config.backend
+    correction = GlobalCorrection(sequence, settings, out) if backend.loops or backend.gps else None
+    map_file = MapFile(out / "map.pcd") if settings.config.output.map and not correction else None
     decoded = _timed(sequence.scans(start, count), stage_ms["decode"])
     scans: Any = prefetched(decoded, settings.config.data.prefetch)
     try:
@@ -134,6 +137,8 @@ def run_sequence(
                         failures.append(failure_record(start + tracked.index, tracked))
                     if map_file:
                         map_file.append(new_map_points(tracked))
+                    if correction:
+                        correction.take(tracked)
                     for observer in observers:
                         observer(tracked, tracked.stage_ms["total"])
                     stage_ms["record"].append((time.perf_counter() - recorded_from) * 1e3)
@@ -144,8 +149,14 @@ def run_sequence(
                 raise interruption
             reasons = " ".join(sequence.warnings_so_far)
             raise LioJaxError(f"{sequence.info.path}: no scan could be read. {reasons}".strip())
-        map_points = map_file.finish() if map_file else None
-        _write_trajectory(out, log, settings)
+        if map_file:
+            map_file.finish()
+        trajectory = log.trajectory()
+        _write_keyframes(out, log, settings)
+        corrected: dict[str, Any] = {}
+        if correction:
+            trajectory, corrected = correction.finish(trajectory, hurry=interruption is not None)
+        _write_trajectory(out, log, trajectory, settings)
         scan_log.write_npz(out / "scans.npz", stage_ms)
         if imu and imu.samples:
             write_imu_rate(out / "imu_rate.tum", log, imu.samples)
@@ -166,12 +177,15 @@ def run_sequence(
             *imu_notes,
             *(imu.warnings() if imu else ()),
             *overflow.warnings(),
+            *(correction.warnings() if correction else ()),
         ],
         "overflow": overflow.metrics(),
+        **({"backend": corrected} if correction else {}),
         "environment": environment(),
     }
     write_json(out / "metrics.json", metrics)
-    return RunResult(log.trajectory(), metrics, stage_ms, map_points, interruption)
+    odometry = log.trajectory() if correction else None
+    return RunResult(trajectory, metrics, stage_ms, odometry, interruption)
 
 
 def imu_feed(sequence: Sequence, settings: Settings) -> tuple[ImuFeed | None, tuple[str, ...]]:
@@ -230,18 +244,20 @@ def peak_rss_mb() -> float:
     return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)
 
 
-def _write_trajectory(out: Path, log: TrajectoryLog, settings: Settings) -> None:
-    trajectory = log.trajectory()
+def _write_trajectory(out: Path, log: TrajectoryLog, trajectory: Trajectory, settings: Settings) -> None:
     with atomic_path(out / "trajectory.tum") as aside:
         write_tum(aside, trajectory)
     with atomic_path(out / "trajectory_kitti.txt") as aside:
-        write_kitti_poses(aside, log.lidar_poses())
+        write_kitti_poses(aside, trajectory.poses @ log.column("extrinsic"))
     log.write_npz(out / "states.npz")
-    output = settings.config.output
+    write_text(out / "config.yaml", settings.to_yaml())
+
+
+def _write_keyframes(out: Path, log: TrajectoryLog, settings: Settings) -> None:
+    output, trajectory = settings.config.output, log.trajectory()
     chosen = keyframe_indices(trajectory.poses, output.keyframe_distance, output.keyframe_angle)
     poses = trajectory.poses[chosen]
     write_g2o(out / "keyframes.g2o", poses, odometry_edges(poses, log.match_covariances()[chosen]))
-    write_text(out / "config.yaml", settings.to_yaml())
 
 
 def _timed(scans: Iterator[LidarScan], decode_ms: list[float]) -> Iterator[LidarScan]:

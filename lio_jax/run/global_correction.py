@@ -1,0 +1,175 @@
+"""The back end of a run: what it is fed with, and the files it leaves in the run folder."""
+
+import tempfile
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.errors import LioJaxError
+from lio_jax.core.files import atomic_path
+from lio_jax.core.settings import Settings
+from lio_jax.data.gps_checks import cleaned
+from lio_jax.data.sequence import Sequence
+from lio_jax.data.trajectory import Trajectory, ns_to_seconds, write_tum
+from lio_jax.loops.back_end import BackEnd, Correction
+from lio_jax.loops.closing import LoopCloser
+from lio_jax.loops.drift_correction import corrected_poses
+from lio_jax.loops.g2o import Edge, write_g2o
+from lio_jax.loops.gps import GpsGate
+from lio_jax.loops.graph import LOOP, ODOMETRY
+from lio_jax.loops.surroundings import thinned
+from lio_jax.run.beside import BesideOdometry
+from lio_jax.run.folder import write_json
+from lio_jax.run.keyframe_store import KeyframeWriter, read_keyframes
+from lio_jax.run.keyframes import KeyframePicker, corner_marks
+from lio_jax.run.map_tiles import MapTiles
+from lio_jax.run.track import Tracked
+
+_KEPT_SPACING = 0.4
+"""Of the points that keyframes keep in memory for loops, m; on disk they have all."""
+
+
+class GlobalCorrection:
+    """Takes every scan's result and corrects the trajectory and the map beside the odometry."""
+
+    def __init__(self, sequence: Sequence, settings: Settings, out: Path) -> None:
+        """Begin beside a run.
+
+        Args:
+            sequence: whose GPS fixes are used.
+            settings: ``config.backend``, ``config.loops``, ``params.loop``, ``params.gps``.
+            out: the run folder.
+
+        Raises:
+            LioJaxError: GPS is asked for and the recording holds none, or the file of pairs is damaged.
+        """
+        self.notes: tuple[str, ...] = ()
+        """What was found wrong with the fixes."""
+        config = settings.config
+        closer = LoopCloser(settings) if config.backend.loops else None
+        gate = self._gate(sequence, settings) if config.backend.gps else None
+        self._settings, self._out = settings, out
+        self._origin = sequence.gps().origin if gate else None  # type: ignore[union-attr]
+        self._picker, self._store = KeyframePicker(settings), KeyframeWriter(out)
+        self._beside = BesideOdometry(BackEnd(settings, closer, gate))
+
+    def take(self, tracked: Tracked) -> None:
+        """Take the next scan's result; this never waits for the back end."""
+        keyframe = self._picker(tracked)
+        if keyframe is not None:
+            self._store.append(keyframe.points, corner_marks(tracked))
+            self._beside.add(replace(keyframe, points=thinned(keyframe.points, _KEPT_SPACING)))
+
+    def finish(self, odometry: Trajectory, hurry: bool) -> tuple[Trajectory, dict[str, Any]]:
+        """Write the corrected results and return the corrected trajectory and what metrics.json says.
+
+        Args:
+            odometry: T_odom_imu of all scans.
+            hurry: leave out what waits still.
+        """
+        found = self._beside.finish(hurry)
+        if not len(found.stamp_ns):
+            return odometry, self._said(found)
+        poses = corrected_poses(
+            odometry.stamp_ns, odometry.poses, found.stamp_ns, found.T_odom_imu, found.T_world_imu
+        )
+        self._store.finish(*self._of_all_stored(found, odometry, poses))
+        with atomic_path(self._out / "odometry.tum") as aside:
+            write_tum(aside, odometry)
+        write_g2o(self._out / "keyframes.g2o", found.T_world_imu, _graph(found))
+        write_json(self._out / "loops.json", {"loops": [_loop(found, *one) for one in found.loops]})
+        if found.T_enu_world is not None:
+            write_json(self._out / "georeference.json", _georeference(found.T_enu_world, self._origin))
+        if self._settings.config.output.map:
+            self._write_map()
+        return Trajectory(odometry.stamp_ns, poses), self._said(found)
+
+    def _gate(self, sequence: Sequence, settings: Settings) -> GpsGate:
+        recorded = sequence.gps()
+        if recorded is None or not len(recorded.stamp_ns):
+            raise LioJaxError(
+                f"{sequence.info.path}: holds no GPS fixes; leave config.backend.gps=true out, or name their "
+                "topic by config.data.gps_topic."
+            )
+        gps, self.notes = cleaned(recorded, "GPS")
+        elevation = settings.config.backend.gps_elevation
+        return GpsGate(gps.stamp_ns, gps.position, gps.covariance, settings.values["gps"], elevation)
+
+    def _of_all_stored(
+        self, found: Correction, odometry: Trajectory, poses: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return stamps and poses of the clouds on disk, also of those the back end did not get to."""
+        stamps = np.array(self._picker.stamps_ns, np.int64)
+        rows = np.searchsorted(odometry.stamp_ns, stamps)
+        return stamps, poses[rows], odometry.poses[rows]
+
+    def _write_map(self) -> None:
+        """Put the keyframes' clouds where the keyframes were found to be."""
+        spacing = self._settings.values["map"]["point_spacing"]
+        with tempfile.TemporaryDirectory(prefix=".tiles.", dir=self._out) as folder:
+            tiles = MapTiles(Path(folder) / "tiles", spacing)
+            for T_world_imu, points in read_keyframes(self._out).clouds():
+                tiles.add(T_world_imu, points)
+            tiles.write(self._out / "map.pcd")
+
+    def _said(self, found: Correction) -> dict[str, Any]:
+        weights = [weight for _, weight in found.loops if weight is not None]
+        refused = Counter(verdict.reason for verdict, weight in found.loops if weight is None)
+        said: dict[str, Any] = {
+            "keyframes": len(found.stamp_ns),
+            "busy_s": round(self._beside.busy_s, 3),
+            "loops": {
+                "closed": len(weights),
+                "distrusted": sum(weight < 0.5 for weight in weights),
+                "refused": dict(refused),
+            },
+            "gps": found.fixes,
+        }
+        return said | ({"error": str(self._beside.error)} if self._beside.error else {})
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return one sentence for each thing that went wrong."""
+        error = self._beside.error
+        kind = type(error).__name__
+        ended = f"the back end ended early ({kind}: {error}); what it had done until then counts."
+        return (*self.notes, *((ended,) if error else ()))
+
+
+def _graph(found: Correction) -> list[Edge]:
+    """Return odometry and loops as g2o tells them, information by the weight they were given."""
+    return [
+        Edge(edge.i, edge.j, edge.measured, edge.information * max(weight, 1e-9))
+        for edge, weight in zip(found.edges, found.weights, strict=True)
+        if edge.kind in (ODOMETRY, LOOP)
+    ]
+
+
+def _loop(found: Correction, verdict: Any, weight: float | None) -> dict[str, Any]:
+    proposal = verdict.proposal
+    return {
+        "source": proposal.source,
+        "target": proposal.target,
+        "source_s": ns_to_seconds(int(found.stamp_ns[proposal.source])),
+        "target_s": ns_to_seconds(int(found.stamp_ns[proposal.target])),
+        "origin": proposal.origin,
+        "accepted": verdict.accepted,
+        "reason": verdict.reason,
+        "weight": weight,
+        "fitness_m2": verdict.fitness if np.isfinite(verdict.fitness) else None,
+        "overlap": verdict.overlap,
+    }
+
+
+def _georeference(
+    T_enu_world: NDArray[np.float64], origin: tuple[float, float, float] | None
+) -> dict[str, Any]:
+    known = origin is not None and bool(np.isfinite(origin).all())
+    names = ("latitude_deg", "longitude_deg", "altitude_m")
+    return {
+        "origin": dict(zip(names, origin, strict=True)) if known and origin else None,
+        "T_enu_world": T_enu_world.tolist(),
+    }
