@@ -1,6 +1,6 @@
 """Loops that are found, missed and wrong on simulated drives whose odometry drifts more than is usual.
 
-    python experiments/bench/loops.py [--only NAME ...] [--json]
+    python experiments/bench/loops.py [--only NAME ...] [--spacing M] [--json]
 
 A keyframe is a revisit if it is within 10 m of one that is more than 30 s older; it is recalled if a loop
 from it enters the graph. A loop is false if it is wrong by more than 1 m or 0.05 rad. The graph is solved at
@@ -39,6 +39,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="drives; all without it")
+    parser.add_argument("--spacing", type=float, default=1.0, help="of the keyframes, m")
     parser.add_argument("--json", action="store_true", help="one JSON object on the last line")
     options = parser.parse_args()
     from lio_jax.commands.runtime import prepare_jax
@@ -49,7 +50,7 @@ def main() -> None:
         f"{'worst m':>8}{'worst rad':>10}{'ms':>7}{'p95':>7}"
     )
     rows = []
-    for name, make in _drives().items():
+    for name, make in _drives(options.spacing).items():
         if options.only and name not in options.only:
             continue
         row = measured(*make())
@@ -62,7 +63,7 @@ def main() -> None:
         for reason, count in row["refused"].items():
             print(f"{'':28}{count:6d} {reason}")
     if options.json:
-        print(json.dumps({"rows": rows}))
+        print(json.dumps({"spacing": options.spacing, "rows": rows}))
 
 
 def measured(keyframes: "list[Keyframe]", truth: np.ndarray) -> dict[str, Any]:
@@ -167,14 +168,14 @@ def error_of(T_target_source: np.ndarray, truth: np.ndarray, source: int, target
     return float(np.linalg.norm(wrong[:3, 3])), float(angle)
 
 
-def _drives() -> dict[str, Callable[[], Drive]]:
+def _drives(spacing: float) -> dict[str, Callable[[], Drive]]:
     return {
-        "city, again": lambda: town("city", 0, again=1.0),
-        "city, other lane, opposite": lambda: town("city", 1, again=-1.0),
-        "city, 3 m aside": lambda: town("city", 2, again=1.0, aside=3.0),
-        "street, again": lambda: town("street", 0, again=1.0),
-        "tunnel, there and back": tunnel,
-        "blocks all alike": alike,
+        "city, again": lambda: town("city", 0, again=1.0, spacing=spacing),
+        "city, other lane, opposite": lambda: town("city", 1, again=-1.0, spacing=spacing),
+        "city, 3 m aside": lambda: town("city", 2, again=1.0, aside=3.0, spacing=spacing),
+        "street, again": lambda: town("street", 0, again=1.0, spacing=spacing),
+        "tunnel, there and back": lambda: tunnel(spacing),
+        "blocks all alike": lambda: alike(spacing=spacing),
     }
 
 
@@ -214,14 +215,15 @@ def town(
     return keyframes_of(world, truth, odometry, times_along(truth, speed), seed=seed), truth
 
 
-def tunnel() -> Drive:
+def tunnel(spacing: float = 1.0) -> Drive:
     """Return a drive through a smooth tunnel, and back in the same lane."""
-    from simulated_keyframes import drifted, driven, keyframes_of
+    from simulated_keyframes import drifted, driven, keyframes_of, times_along
 
     from lio_jax.sim.world_registry import build
 
     world = build("tunnel", 0).world
-    there = np.stack([np.arange(0.0, 660.0), np.zeros(660)], axis=1)
+    along = np.arange(0.0, 660.0, spacing)
+    there = np.stack([along, np.zeros_like(along)], axis=1)
     truth = np.concatenate([driven(world, there, above=3.0), driven(world, there[::-1], above=3.0)])
     odometry = drifted(truth, scale=0.02, heading=0.0, noise=0.02)
     return keyframes_of(world, truth, odometry, times_along(truth)), truth

@@ -89,6 +89,9 @@ class LoopCloser:
         run = np.array(self._run)
         self._refused += [verdict for verdict in verdicts if not verdict.accepted]
         accepted = [verdict for verdict in verdicts if verdict.accepted]
+        for verdict in verdicts:
+            if verdict.proposal.twin is not None:
+                self._consensus.doubt(verdict.proposal.source)
         entering = []
         for verdict in accepted:
             if verdict.proposal.origin == "external":
@@ -101,6 +104,7 @@ class LoopCloser:
             self._refused += [replace(verdict, accepted=False, reason=_SAME) for verdict in own[1:]]
         else:
             self._refused += [replace(verdict, accepted=False, reason=_AMBIGUOUS) for verdict in own]
+            self._consensus.doubt(own[0].proposal.source)
         return entering
 
     def _from_outside(

@@ -31,6 +31,12 @@ class Consensus:
         self._limits = limits
         self.entered: list[Verdict] = []
         self.waiting: list[Verdict] = []
+        self._doubtful: list[int] = []
+
+    def doubt(self, source: int) -> None:
+        """Note a keyframe that looks like several places, or was found to be in several: a loop in its
+        neighbourhood has to be confirmed by more others than there are of them."""
+        self._doubtful.append(source)
 
     def with_loop(
         self, loop: Verdict, keyframes: Sequence[Keyframe], run: NDArray[np.float64]
@@ -52,7 +58,9 @@ class Consensus:
         return entering
 
     def _confirmed(self, loop: Verdict, keyframes: Sequence[Keyframe], run: NDArray[np.float64]) -> bool:
-        agree = contradict = 0
+        agree = 0
+        near = np.abs(run[self._doubtful] - run[loop.proposal.source]) <= self._limits["support_reach"]
+        contradict = int(np.sum(near))
         for other in (*self.entered, *self.waiting):
             legs = _legs(loop, other, run)
             if other is loop or max(legs) > self._limits["support_reach"]:

@@ -1,7 +1,7 @@
 """Which earlier keyframes the newest one is compared with."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +17,8 @@ _SHARE_OF_RADIUS = 0.5
 """Places whose distance may be wrong by more than this share of the radius are also sought by descriptor."""
 _RIVAL = 1.25
 """A second place is compared if its descriptor differs by no more than this many times the best one's."""
+_TWIN = 1.1
+"""The same for places that are out of the question: they make the best one doubtful without comparison."""
 _DESCRIBED_SHIFT = 12.0
 """By how much the place of the keyframe that looks most alike may be off, m."""
 _GUESSED_TURN = 0.25
@@ -40,6 +42,8 @@ class Proposal:
     """... and in heading, rad."""
     metres: float
     """Of odometry between the two along the shortest way, closed loops being short cuts."""
+    twin: int | None = None
+    """Another keyframe that looks as much alike, where the odometry cannot have been."""
 
 
 def is_old(keyframes: Sequence[Keyframe], source: int, time_gap: float) -> NDArray[np.bool_]:
@@ -111,8 +115,9 @@ def described_proposals(
 ) -> list[Proposal]:
     """Return the newest keyframe with the old one that looks most alike, where drift may hide its distance.
 
-    Beside it stands the one most alike in another place, if it is about as much alike: both being accepted
-    with different results tells that the places are too similar to be told apart.
+    It is compared with all old places, for a place that looks like several is no evidence of any. Another one
+    about as much alike that may be the right one as well is proposed too: both being accepted with different
+    results tells that they are too similar. One that cannot be the right one is noted as a twin.
 
     Args:
         places: descriptors of all keyframes.
@@ -123,18 +128,30 @@ def described_proposals(
     """
     error = possible_error(metres, limits)
     distance = np.linalg.norm(poses[:, :3, 3] - poses[-1, :3, 3], axis=1)
-    hidden = error.position > _SHARE_OF_RADIUS * limits["radius"]
-    (open_to,) = np.nonzero(old & hidden & (distance <= error.position + limits["radius"]))
-    found = places.compared(poses, open_to, error.heading[open_to])
+    possible = distance <= error.position + limits["radius"]
+    hidden = old & (error.position > _SHARE_OF_RADIUS * limits["radius"])
+    if not np.any(hidden & possible):
+        return []
+    (compared,) = np.nonzero(hidden)
+    everywhere = places.compared(poses, compared, error.heading[compared])
+    found = everywhere.among(possible[everywhere.index])
     best = _most_alike(found, limits["descriptor_distance"])
     if best is None:
         return []
-    first = found.index[best]
-    elsewhere = np.linalg.norm(poses[found.index, :3, 3] - poses[first, :3, 3], axis=1) > 2 * limits["radius"]
-    rivals = found.among(elsewhere)
-    rival = _most_alike(rivals, _RIVAL * found.distance[best])
-    chosen = [(found, best)] if rival is None else [(found, best), (rivals, rival)]
-    return [_described(some, row, poses, metres) for some, row in chosen]
+    likeness = found.distance[best]
+
+    def elsewhere(some: Likeness) -> Likeness:
+        away = np.linalg.norm(poses[some.index, :3, 3] - poses[found.index[best], :3, 3], axis=1)
+        return some.among(away > 2 * limits["radius"])
+
+    impossible = elsewhere(everywhere.among(~possible[everywhere.index]))
+    twin = _most_alike(impossible, _TWIN * likeness)
+    first = _described(found, best, poses, metres)
+    if twin is not None:
+        return [replace(first, twin=int(impossible.index[twin]))]
+    rivals = elsewhere(found)
+    rival = _most_alike(rivals, _RIVAL * likeness)
+    return [first] if rival is None else [first, _described(rivals, rival, poses, metres)]
 
 
 def _most_alike(found: Likeness, limit: float) -> int | None:

@@ -72,6 +72,8 @@ def verify(proposal: Proposal, keyframes: Sequence[Keyframe], poses: _Array, set
     """
     limits, sizes = settings.values["loop"], settings.config.loops
     source, target = proposal.source, proposal.target
+    if proposal.twin is not None:
+        return refused(proposal, f"keyframe {proposal.twin}, where it cannot be, looks as much alike")
     old = is_old(keyframes, source, limits["time_gap"])
     around = range(max(0, target - sizes.submap_keyframes), target + sizes.submap_keyframes + 1)
     members = [k for k in around if k < len(keyframes) and (old[k] or k == target)]
