@@ -5,14 +5,16 @@ odometry via smoothing and mapping", IROS 2020, III-D and III-E): odometry, loop
 What becomes of a keyframe depends on those up to it alone, never on the clock.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.pose_covariance import carried
 from lio_jax.core.settings import Settings
-from lio_jax.loops.closing import LoopCloser, held_by
+from lio_jax.loops.closing import held_by
 from lio_jax.loops.drift_correction import levelled_onto
 from lio_jax.loops.gps import Fix, GpsGate, Refusal
 from lio_jax.loops.gps_alignment import alignment
@@ -50,10 +52,23 @@ class Correction:
     """(4, 4) from world to the fixes' east-north-up frame; None without fixes, or too few for the heading."""
 
 
+@runtime_checkable
+class FindsLoops(Protocol):
+    """Such as :class:`lio_jax.loops.closing.LoopCloser`."""
+
+    def take(self, keyframes: Sequence[Keyframe], poses: _Array) -> list[Verdict]:
+        """Take up the newest keyframe; return the loops that enter the graph now."""
+        ...
+
+    def outcomes(self) -> list[Verdict]:
+        """Return every proposal so far with what became of it."""
+        ...
+
+
 class BackEnd:
     """Takes keyframes in order."""
 
-    def __init__(self, settings: Settings, closer: LoopCloser | None, gate: GpsGate | None) -> None:
+    def __init__(self, settings: Settings, closer: FindsLoops | None, gate: GpsGate | None) -> None:
         """Begin without keyframes.
 
         Args:
@@ -124,7 +139,7 @@ class BackEnd:
         self._keyframes.append(keyframe)
         self._poses = np.concatenate([self._poses, pose[None]])
 
-    def _close_loops(self, closer: LoopCloser) -> bool:
+    def _close_loops(self, closer: FindsLoops) -> bool:
         """Add the loops that are found now; return whether one contradicts the poses."""
         entering = closer.take(self._keyframes, self._poses)
         for verdict in entering:

@@ -1,7 +1,7 @@
 """Distrust edges that contradict the others, by graduated non-convexity."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,10 @@ class Robust:
     """Share of right edges whose r' Omega r is below the limit, by the chi-square distribution."""
     trusted_kinds: tuple[int, ...] = (ODOMETRY, PRIOR)
     """Edges that are taken to be right."""
+    begin: Literal["trusted", "given"] = "trusted"
+    """Whose residuals come first: those at the poses that the trusted edges ask for, which finds the right
+    ones among many wrong edges; or at the given poses, such as the best ones with all edges, which finds a
+    few wrong edges among right ones that the trusted edges contradict together."""
 
 
 class Graduated(NamedTuple):
@@ -56,7 +60,8 @@ def graduate(
         graph: as it is.
         structure: of the graph.
         padded: the graph at its padded size.
-        poses: to begin with where the trusted edges don't connect the graph; of the padded size.
+        poses: to begin with where ``robust.begin`` says so, or the trusted edges don't connect the graph; of
+            the padded size.
         robust: which edges may be wrong.
         limits: of the last descent, with the weights found.
     """
@@ -66,7 +71,7 @@ def graduate(
     )
     limit = chi2.ppf(robust.confidence, size)
     weights = np.where(doubted, 0.0, 1.0)
-    start = _poses_of_trusted(graph, structure, ~doubted)
+    start = _poses_of_trusted(graph, structure, ~doubted) if robust.begin == "trusted" else None
     if start is None:
         weights[:] = 1.0
     else:
