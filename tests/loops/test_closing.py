@@ -104,3 +104,14 @@ def test_a_loop_driven_twice_is_closed_wherever_it_is_driven_again(twice_around_
         moved, turned = error_of(loop.T_target_source, truth, loop.proposal.source, loop.proposal.target)
         assert moved < 0.5
         assert turned < 0.02
+
+
+def test_a_loop_among_doubtful_places_has_to_be_confirmed_by_more_than_there_are_of_them():
+    closer = LoopCloser(Settings())
+    keyframes = driven_on(closer, 70)
+    for source in (50, 51, 52):
+        closer.settle([verdict(source, 5), verdict(source, 30, origin="descriptor")], keyframes)
+    for source in (53, 54, 55, 56):
+        assert closer.settle([verdict(source, source - 48)], keyframes) == []
+    entering = closer.settle([verdict(57, 9)], keyframes)
+    assert [loop.proposal.source for loop in entering] == [53, 54, 55, 56, 57]
