@@ -101,7 +101,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "voxel_size": 1.2,
         "overlap_distance": 0.5,
         "overlap": 0.7,
-        "fitness": 0.1,
+        "fitness": 0.12,
         "conflict": 0.3,
         "rival": 0.9,
         "rotation_sigma": 0.005,
