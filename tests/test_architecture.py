@@ -33,9 +33,15 @@ FLOORS = {
     "cli": 7,
 }
 
-NEIGHBOURS = {("sim", "data"), ("viz", "evaluation"), ("ablation", "evaluation"), ("cli", "commands")}
-"""Imports within a floor, one way only: a simulated drive is a Sequence, a plot against truth is aligned as
-its score is, an ablation scores its runs, and a command line has commands."""
+NEIGHBOURS = {
+    ("sim", "data"),
+    ("loops", "registration"),
+    ("viz", "evaluation"),
+    ("ablation", "evaluation"),
+    ("cli", "commands"),
+}
+"""Imports within a floor, one way only: a simulated drive is a Sequence, a loop is aligned as a scan is, a
+plot against truth is aligned as its score is, an ablation scores its runs, a command line has commands."""
 
 HEAVY = {"rerun", "evo", "matplotlib", "rosbags", "pypcd4", "distributed", "pyarrow"}
 

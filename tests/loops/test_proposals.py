@@ -72,6 +72,13 @@ def test_a_place_as_much_alike_elsewhere_is_compared_as_well():
     assert {proposal.target for proposal in proposals} == {0, 2}
 
 
+def test_a_twin_where_the_odometry_cannot_have_been_is_noted():
+    again = seen_from(pose(yaw=0.1), pillars(10))
+    (proposal,), _ = described([10, 11, 12, 13], WHERE, pose(10, 10), again, metres=400.0, twin=3)
+    assert proposal.target == 0
+    assert proposal.twin == 3
+
+
 def test_a_place_that_looks_like_none_before_is_not_compared():
     new = seen_from(pose(), pillars(99))
     assert described([10, 11, 12, 13], WHERE, pose(60, 20), new, metres=1000.0)[0] == []

@@ -124,3 +124,11 @@ def test_where_nothing_stands_there_is_nothing_to_compare():
     verdict = verify(proposed(keyframes, truth, odometry, 5, 500.0), keyframes, odometry, SETTINGS)
     assert not verdict.accepted
     assert verdict.reason == "nothing upright to compare"
+
+
+def test_a_place_with_a_twin_is_refused_without_being_aligned():
+    keyframes, truth, odometry = city("same way")
+    proposal = replace(proposed(keyframes, truth, odometry, nearest(truth), 500.0), twin=7)
+    verdict = verify(proposal, keyframes, odometry, SETTINGS)
+    assert not verdict.accepted
+    assert "keyframe 7" in verdict.reason
