@@ -23,8 +23,8 @@ SPARSE = spinning_lidar(16, 512, elevation_deg=(-15.0, 15.0))
 """16 beams, 512 firings a turn."""
 _BODY_HEIGHT = 1.6
 _SPACING = 0.4
-_COVARIANCE = np.diag([5e-3**2] * 3 + [5e-2**2] * 3)
-"""Of a step: what a bad odometry should say of itself."""
+_COVARIANCE = np.diag([1e-3**2] * 3 + [1e-2**2] * 3)
+"""Of a step, as a run takes it by default."""
 
 
 def rounded(vertices: Sequence[Sequence[float]], radius: float = 7.0, spacing: float = 1.0) -> _Array:

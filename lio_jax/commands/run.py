@@ -19,6 +19,7 @@ from lio_jax.data.trajectory import Trajectory, write_tum
 from lio_jax.recipes import recipe_named
 from lio_jax.run.folder import run_folder, write_json
 from lio_jax.run.run import Observer, RunResult, check_start, run_sequence, settings_for
+from lio_jax.viz.correction_record import read_correction
 from lio_jax.viz.recording import Recording
 from lio_jax.viz.run_recording import RecordingObserver
 
@@ -125,6 +126,9 @@ def run_into(
         result = run_sequence(sequence, settings, out, start, count, observers)
         if isinstance(result.interruption, KeyboardInterrupt):
             say("interrupted: finishing the files of what was computed ...")
+        if recording and (found := read_correction(out)):
+            loops = {name: found.strips(name == "closed") for name in ("closed", "refused")}
+            recording.log_correction(found.trajectory.positions, found.keyframes, loops)
         if recording and truth is not None:
             recording.log_truth(_in_world_of(result.trajectory, truth).positions)
     result.metrics["notes"] = [*sequence.info.notes, *notes]
@@ -193,6 +197,8 @@ def _finish(result: RunResult, truth: Trajectory | None, settings: Settings, out
             # the evaluation has notes of its own
             noted = [*result.metrics["notes"], *evaluation.notes]
             result.metrics |= evaluation.as_dict() | {"notes": noted}
+            if result.odometry is not None:
+                result.metrics["odometry"] = evaluate(result.odometry, truth).as_dict()
             text = format_evaluation(evaluation)
             with atomic_path(out / "truth.tum") as aside:
                 write_tum(aside, match_by_time(result.trajectory, truth).reference)
@@ -225,6 +231,7 @@ def _summary(result: RunResult, out: Path) -> str:
     metrics = result.metrics
     total = metrics["scan_ms"]["total"]
     steps = np.linalg.norm(np.diff(result.trajectory.positions, axis=0), axis=1)
+    corrected = _corrected(metrics["backend"]) if "backend" in metrics else []
     return "\n".join(
         [
             f"scans      {metrics['scans']}  ({steps.sum():.2f} m travelled)",
@@ -233,9 +240,21 @@ def _summary(result: RunResult, out: Path) -> str:
             f"compile    {metrics['compile_s']:.2f} s",
             f"wall       {metrics['wall_s']:.1f} s",
             f"memory     {metrics['peak_rss_mb']:.0f} MiB peak",
+            *corrected,
             f"results    {out}",
         ]
     )
+
+
+def _corrected(said: dict[str, Any]) -> list[str]:
+    loops, fixes = said["loops"], said["gps"]
+    refused = sum(loops["refused"].values())
+    lines = [
+        f"loops      {loops['closed']} closed, {loops['distrusted']} of them distrusted, {refused} refused"
+    ]
+    if fixes:
+        lines.append(f"GPS        {fixes['used']} of {said['keyframes']} keyframes have a fix")
+    return lines
 
 
 def _raise_if_interrupted(result: RunResult, out: Path) -> None:

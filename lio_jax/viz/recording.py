@@ -42,6 +42,7 @@ _RAW_COLOUR, _ADDED_COLOUR = (150, 150, 150), (230, 80, 60)
 _CORNER_COLOUR, _SURFACE_COLOUR = (214, 39, 40), (23, 190, 207)
 SIGMA_SCALE = 100.0
 """Position sigmas are centimetres: ellipsoids are drawn so many times larger."""
+_CORRECTED_COLOUR, _CLOSED_COLOUR, _REFUSED_COLOUR = (148, 103, 189), (44, 160, 44), (214, 39, 40)
 _ARROW_M = 5.0
 
 
@@ -50,7 +51,8 @@ class Recording:
 
     Entities: world/lidar (pose), world/lidar/scan (compensated), world/lidar/raw, world/lidar/corners and
     surfaces, world/lidar/unobserved, world/imu (pose), world/imu/position_100_sigma, world/added,
-    world/map/NN, world/trajectory, world/truth, metrics/GROUP/NAME.
+    world/map/NN, world/trajectory, world/truth, metrics/GROUP/NAME; with a back end also world/corrected,
+    world/keyframes, world/loops/closed and refused.
     Time lines: "scan" (index) and "time" (the recording's own clock).
     """
 
@@ -187,6 +189,26 @@ class Recording:
     def log_trajectory(self, positions: NDArray[np.floating]) -> None:
         """Log the (n, 3) positions in world as they are known at the last logged scan."""
         self._log_strip("world/trajectory", positions, _ESTIMATE_COLOUR, static=False)
+
+    def log_correction(
+        self, positions: NDArray[np.floating], keyframes: NDArray[np.floating], loops: Mapping[str, NDArray]
+    ) -> None:
+        """Log what the back end found, as it is known at the last logged scan.
+
+        Args:
+            positions: (n, 3) m in world, of the corrected trajectory.
+            keyframes: (k, 3) m.
+            loops: "closed" and "refused": (m, 2, 3) m, the ends of each.
+        """
+        import rerun as rr
+
+        self._log_strip("world/corrected", positions, _CORRECTED_COLOUR, static=False)
+        self._log_points("world/keyframes", keyframes, _CORRECTED_COLOUR, -3.0)
+        for name, colour in (("closed", _CLOSED_COLOUR), ("refused", _REFUSED_COLOUR)):
+            strips = np.asarray(loops[name], np.float32)
+            self._open_stream().log(
+                f"world/loops/{name}", rr.LineStrips3D(strips, colors=[colour], radii=-1.5)
+            )
 
     def log_truth(self, positions: NDArray[np.floating]) -> None:
         """Log the (n, 3) true positions, already laid into the estimate's world, for all times."""

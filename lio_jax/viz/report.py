@@ -38,6 +38,7 @@ def run_report(run: RunRecord) -> str:
             tiles(headline(run)),
             section("Warnings and failures", *_complaints(run)),
             section("Trajectory", figures(*run_figures.from_above(run), run_figures.from_the_side(run))),
+            _global_correction(run),
             section("Errors", figures(*run_figures.errors(run, compared))) if compared else "",
             section("Drift", figures(*run_figures.relative_error_boxes(compared))) if compared else "",
             section("What the filter believed", figures(*run_figures.belief(run))),
@@ -48,6 +49,18 @@ def run_report(run: RunRecord) -> str:
             section("Configuration", folded("config.yaml, every value resolved", run.config_yaml)),
         ],
     )
+
+
+def _global_correction(run: RunRecord) -> str:
+    said = run.metrics.get("backend")
+    if not said:
+        return ""
+    loops = said["loops"]
+    rows = [("keyframes", said["keyframes"]), ("loops closed", loops["closed"])]
+    rows += [("closed, but distrusted by the graph", loops["distrusted"])] if loops["distrusted"] else []
+    rows += [(f"loops refused: {reason}", count) for reason, count in loops["refused"].items()]
+    rows += [(f"GPS fixes: {reason}", count) for reason, count in said["gps"].items()]
+    return section("Global correction", table(("", ""), rows), figures(*run_figures.loops_closed(run)))
 
 
 def headline(run: RunRecord) -> dict[str, str]:

@@ -50,6 +50,28 @@ def from_above(run: RunRecord) -> list[str]:
     return [figure("Map from above", svg, caption, legend, wide=True), *drawn]
 
 
+def loops_closed(run: RunRecord) -> list[str]:
+    """Return the way before and after its correction, with the loops between keyframes."""
+    found = run.correction
+    if found is None:
+        return []
+    before, after = run.odometry.positions, run.trajectory.positions
+    lines = [Line(before[:, 0], before[:, 1], 1, dashed=True), Line(after[:, 0], after[:, 1], 0)]
+    legend = [("odometry", 1), ("corrected", 0)]
+    for closed, name, series in ((False, "refused", 7), (True, "closed", 2)):
+        strips = found.strips(closed)
+        # a value that is not finite parts one loop from the next
+        apart = np.concatenate([strips, np.full((len(strips), 1, 3), np.nan)], axis=1).reshape(-1, 3)
+        if len(strips):
+            lines.append(Line(apart[:, 0], apart[:, 1], series))
+            legend.append((f"loops {name}", series))
+    axes = equal_axes([line.x for line in lines], [line.y for line in lines], width=WIDTH)
+    if axes is None:
+        return [figure("Loops", empty("no pose is finite"))]
+    svg = plan_chart(axes, lines, "x [m]", "y [m]")
+    return [figure("Loops", svg, "From above, to scale.", legend, wide=True)]
+
+
 def from_the_side(run: RunRecord) -> str:
     """Return the height over the way."""
     lines, legend = [Line(run.distance, run.trajectory.positions[:, 2], 0)], [("estimate", 0)]

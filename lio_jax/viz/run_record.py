@@ -1,7 +1,7 @@
 """Read back what a run left in its folder, for reports."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from lio_jax.data.trajectory import Trajectory, read_tum
 from lio_jax.evaluation.alignment import Alignment, align
 from lio_jax.evaluation.association import MatchedTrajectories, match_by_time
 from lio_jax.run.cloud_file import read_cloud
+from lio_jax.viz.correction_record import CorrectionRecord, read_correction
 
 _NEEDED = ("states.npz", "metrics.json", "config.yaml")
 
@@ -50,10 +51,17 @@ class RunRecord:
     """None without truth."""
     remarks: list[str] = field(default_factory=list)
     """What could not be read or compared."""
+    correction: CorrectionRecord | None = None
+    """None of a run without a back end."""
 
     @property
     def trajectory(self) -> Trajectory:
-        """T_world_imu at the scans' ends."""
+        """T_world_imu at the scans' ends, corrected where there was a back end."""
+        return self.correction.trajectory if self.correction else self.odometry
+
+    @property
+    def odometry(self) -> Trajectory:
+        """T_world_imu at the scans' ends as it was estimated scan by scan."""
         return Trajectory(self.states["stamps_ns"], self.states["poses"])
 
     @property
@@ -110,9 +118,10 @@ def read_run(folder: Path) -> RunRecord:
     except (OSError, ValueError, yaml.YAMLError, EOFError) as error:
         raise LioJaxError(f"{reading}: cannot be read ({error}); run again.") from None
     remarks: list[str] = []
-    trajectory = Trajectory(states["stamps_ns"], states["poses"])
-    comparison = _compared(folder / "truth.tum", trajectory, remarks)
-    return RunRecord(folder, metrics, text, config, states, scans, comparison, remarks)
+    run = RunRecord(
+        folder, metrics, text, config, states, scans, remarks=remarks, correction=read_correction(folder)
+    )
+    return replace(run, comparison=_compared(folder / "truth.tum", run.trajectory, remarks))
 
 
 def _columns(path: Path) -> dict[str, NDArray]:
