@@ -23,15 +23,21 @@ _CHECKED = (
 )
 install_import_hook([f"lio_jax.{name}" for name in _CHECKED.split()], f"{type_checker.__name__}.checked")
 
-_MAPPINGS = Path("/proc/self/maps")
+_MAPPINGS, _MEMORY = Path("/proc/self/maps"), Path("/proc/self/statm")
 _MOST_MAPPINGS = 40_000
 """The kernel allows a process 65,530. Compiled programs take several each; where one finds none left, the
 process ends by a segmentation fault."""
+_MOST_MEMORY = 3 * 2**30
+"""Bytes; several processes share a machine, and most of what they hold are programs not needed again."""
 
 
 @pytest.fixture(scope="module", autouse=True)
 def room_for_programs():
     """Give the room of the last modules' programs to the next one's where it runs short."""
-    if _MAPPINGS.exists() and _MAPPINGS.read_bytes().count(b"\n") > _MOST_MAPPINGS:
+    if not _MEMORY.exists():
+        return
+    mappings = _MAPPINGS.read_bytes().count(b"\n")
+    resident = int(_MEMORY.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    if mappings > _MOST_MAPPINGS or resident > _MOST_MEMORY:
         jax.clear_caches()
         gc.collect()

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lio_jax.core.errors import LioJaxError
+from lio_jax.data.static_transforms import register_type
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -57,8 +58,10 @@ def open_bag(paths: Sequence[Path]) -> Iterator["AnyReader"]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
+    typestore = get_typestore(Stores.ROS2_HUMBLE)
+    register_type(typestore)
     try:
-        reader = AnyReader(list(paths), default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader = AnyReader(list(paths), default_typestore=typestore)
         reader.open()
     # Damaged files make the index and codec libraries raise whatever they stumble over.
     except Exception as error:

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from lio_jax.core.errors import UsageError
-from lio_jax.data.ros_messages import TRANSFORM_TYPE, Message
+from lio_jax.data import static_transforms
+from lio_jax.data.ros_messages import Message
 from lio_jax.data.whole_output import written_whole
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def _ros1_writer(path: Path, typestore: Any) -> Iterator[Callable[[Message], Non
     with Writer(path) as writer:
 
         def connect(topic: str, kind: str) -> Any:
-            latching = 1 if kind == TRANSFORM_TYPE else None
+            latching = 1 if kind == static_transforms.TYPE else None
             return writer.add_connection(topic, kind, typestore=typestore, latching=latching)
 
         yield _storing(writer, connect)
@@ -99,7 +100,7 @@ def _ros2_writer(folder: Path, bag_format: BagFormat, typestore: Any) -> Iterato
     with Writer(folder, version=_ROS2_VERSION, storage_plugin=plugin) as writer:
 
         def connect(topic: str, kind: str) -> Any:
-            offered = [_latched()] if kind == TRANSFORM_TYPE else []
+            offered = [_latched()] if kind == static_transforms.TYPE else []
             return writer.add_connection(topic, kind, typestore=typestore, offered_qos_profiles=offered)
 
         yield _storing(writer, connect)

@@ -29,6 +29,16 @@ def read_header(raw: bytes, ros2: bool) -> RosHeader:
     return RosHeader(seconds * 1_000_000_000 + nanoseconds, 16 + length, order)
 
 
+def read_frame(raw: bytes, ros2: bool) -> str:
+    """Return the frame that the header of a raw message names.
+
+    Raises:
+        ValueError: the message is shorter than its header.
+    """
+    # CDR ends strings with a zero byte
+    return raw[16 : read_header(raw, ros2).body].rstrip(b"\0").decode(errors="replace")
+
+
 def cdr_aligned(offset: int, size: int) -> int:
     """Return the first offset at or after ``offset`` where CDR places a value of ``size`` bytes."""
     return 4 + -(-(offset - 4) // size) * size

@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lio_jax.data import gps_messages, imu_messages, pointcloud2
+from lio_jax.data import gps_messages, imu_messages, pointcloud2, static_transforms
 
 POSE_TYPE = "geometry_msgs/msg/PoseStamped"
-TRANSFORM_TYPE = "tf2_msgs/msg/TFMessage"
 
-_TRANSFORMS = "geometry_msgs/TransformStamped[] transforms\n"
 _LIVOX_POINT = """uint32 offset_time
 float32 x
 float32 y
@@ -59,8 +57,7 @@ class RosMessages:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         store = get_typestore(Stores.ROS2_HUMBLE if self._ros2 else Stores.ROS1_NOETIC)
-        if TRANSFORM_TYPE not in store.types:
-            store.register(get_types_from_msg(_TRANSFORMS, TRANSFORM_TYPE))
+        static_transforms.register_type(store)
         package = self.livox_type.removesuffix("CustomMsg")
         store.register(get_types_from_msg(_LIVOX_POINT, f"{package}CustomPoint"))
         store.register(get_types_from_msg(_LIVOX_MESSAGE, f"{package}CustomMsg"))
@@ -153,11 +150,11 @@ class RosMessages:
         self, parent: str, child: str, stamp_ns: int, T_parent_child: NDArray[np.float64]
     ) -> Message:
         """Return the /tf_static message of a (4, 4) transform."""
-        topic = "/tf_static"
+        topic = static_transforms.TOPIC
         body = self._make("geometry_msgs/msg/Transform", *self._parts("Vector3", T_parent_child))
         header = self._header(topic, parent, stamp_ns)
         stamped = self._make("geometry_msgs/msg/TransformStamped", header, child, body)
-        return self._message(topic, stamp_ns, TRANSFORM_TYPE, [stamped])
+        return self._message(topic, stamp_ns, static_transforms.TYPE, [stamped])
 
     def _message(self, topic: str, received_ns: int, kind: str, *body: Any) -> Message:
         message = self._make(kind, *body)

@@ -6,9 +6,12 @@ from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data import gps_messages, imu_messages, livox, pointcloud2
+from lio_jax.data import gps_messages, imu_messages, livox, pointcloud2, static_transforms
 from lio_jax.data.bag_files import bag_paths, open_bag, until_damage
 from lio_jax.data.bag_scans import decode_cloud, recognise_scans
 from lio_jax.data.bag_topics import BagContents, Topic, bag_topics, choose_topic, listed
@@ -16,8 +19,9 @@ from lio_jax.data.gps_messages import GpsCollector
 from lio_jax.data.imu_messages import ImuCollector
 from lio_jax.data.imu_units import accel_scale
 from lio_jax.data.order import Stamped, in_time_order
-from lio_jax.data.ros_header import read_header
+from lio_jax.data.ros_header import read_frame, read_header
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
+from lio_jax.data.static_transforms import frame_name, gathered, transform_between
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.data.warning_log import WarningLog
 
@@ -27,6 +31,7 @@ if TYPE_CHECKING:
 _LIDAR_TYPES = dict.fromkeys((pointcloud2.TYPE, *sorted(livox.TYPES)), "a point cloud")
 _IMU_TYPES = {imu_messages.TYPE: "an Imu"}
 _GPS_TYPES = {gps_messages.FIX_TYPE: "a NavSatFix", gps_messages.ODOMETRY_TYPE: "an Odometry"}
+_STATIC = (static_transforms.TOPIC, static_transforms.TYPE)
 _GPS_NAMES = ("gps", "gnss", "rtk")
 
 
@@ -56,6 +61,7 @@ class RosbagSequence:
             self._gps_topic = self._choose_gps(topics)
             messages = until_damage(self._messages(reader, self._lidar), lambda reason: None)
             self._reading = recognise_scans(reader, self._lidar, messages, config, self._where)
+            self._T_imu_lidar = self._extrinsic(reader, topics)
         self._notes.extend(self._reading.notes)
 
     @property
@@ -66,6 +72,7 @@ class RosbagSequence:
             format="rosbag",
             path=str(self._path),
             scan_count=self._lidar.count,
+            T_imu_lidar=self._T_imu_lidar,
             notes=tuple(self._notes),
         )
 
@@ -173,6 +180,40 @@ class RosbagSequence:
                 f"{self._path}: topic {lidar.name} holds no messages; record or choose another."
             )
         return lidar
+
+    def _extrinsic(self, reader: "AnyReader", topics: tuple[Topic, ...]) -> NDArray[np.float64] | None:
+        """Return what the bag's static transforms say of the lidar's pose on the IMU, if anything."""
+        static = [topic for topic in topics if (topic.name, topic.type) == _STATIC]
+        if self._imu_topic is None or not static:
+            return None
+        frames = [self._frame(reader, topic) for topic in (self._imu_topic, self._lidar)]
+        if None in frames or frames[0] == frames[1]:
+            # drivers left at their defaults share one frame's name
+            return None
+        imu, lidar = map(str, frames)
+
+        def broken(reason: str) -> None:
+            self._warnings.add(f"{self._path}: {static_transforms.TOPIC} is damaged ({reason}).")
+
+        messages = until_damage(self._messages(reader, *static), broken)
+        decoded = (reader.deserialize(raw, static_transforms.TYPE) for _, _, raw in messages)
+        try:
+            T_imu_lidar = transform_between(gathered(decoded), imu, lidar)
+        # The generated decoders raise struct, index or their own errors on damaged bytes.
+        except Exception as error:
+            broken(str(error))
+            return None
+        if T_imu_lidar is None:
+            self._notes.append(f"T_imu_lidar: {static_transforms.TOPIC} does not tie {lidar} to {imu}")
+        else:
+            self._notes.append(f"T_imu_lidar: {static_transforms.TOPIC} states the pose of {lidar} in {imu}")
+        return T_imu_lidar
+
+    def _frame(self, reader: "AnyReader", topic: Topic) -> str | None:
+        for _, _, raw in until_damage(self._messages(reader, topic), lambda reason: None):
+            with suppress(ValueError):
+                return frame_name(read_frame(raw, reader.is2))
+        return None
 
     def _choose_gps(self, topics: tuple[Topic, ...]) -> Topic | None:
         """Take an Odometry as GPS unasked only if its name says so: most are some estimator's output."""

@@ -20,6 +20,7 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 IMU = "sensor_msgs/msg/Imu"
 FIX = "sensor_msgs/msg/NavSatFix"
 ODOMETRY = "nav_msgs/msg/Odometry"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 LIVOX = tuple(f"{package}/msg/CustomMsg" for package in ("livox_ros_driver", "livox_ros_driver2"))
 
 _LIVOX_POINT = """uint32 offset_time
@@ -134,6 +135,8 @@ def store(ros2: bool) -> Any:
     for name in LIVOX:
         types.register(get_types_from_msg(_LIVOX_POINT, name.replace("CustomMsg", "CustomPoint")))
         types.register(get_types_from_msg(_LIVOX_MESSAGE, name))
+    if TRANSFORMS not in types.types:
+        types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
     return types
 
 
@@ -260,6 +263,24 @@ def odometry_message(stamp_ns: int, position: tuple[float, float, float], ros2: 
         kind["Twist"](kind["Vector3"](0.0, 0.0, 0.0), kind["Vector3"](0.0, 0.0, 0.0)), covariance
     )
     return types[ODOMETRY](header(stamp_ns, ros2, "map"), "base", pose, twist)
+
+
+def transform_message(
+    stamp_ns: int, transforms: dict[tuple[str, str], tuple[tuple[float, ...], tuple[float, ...]]], ros2: bool
+) -> Any:
+    """Return a TFMessage of (parent, child) -> (translation, quaternion xyzw)."""
+    types = store(ros2).types
+    kind = {name: types[f"geometry_msgs/msg/{name}"] for name in ("Vector3", "Quaternion", "Transform")}
+    return types[TRANSFORMS](
+        [
+            types["geometry_msgs/msg/TransformStamped"](
+                header(stamp_ns, ros2, parent),
+                child,
+                kind["Transform"](kind["Vector3"](*position), kind["Quaternion"](*quaternion)),
+            )
+            for (parent, child), (position, quaternion) in transforms.items()
+        ]
+    )
 
 
 Message = tuple[str, int, Any]

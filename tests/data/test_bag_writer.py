@@ -60,8 +60,10 @@ def test_native_to_bag_to_reader_gives_the_same(tmp_path: Path, name: str, layou
     assert read.info.scan_count == SCANS
     scans = list(read.scans())
     assert read.warnings_so_far == ()
-    (note,) = read.info.notes
+    extrinsic, note = read.info.notes
     assert note.endswith("header stamp at scan start")
+    assert extrinsic.startswith("T_imu_lidar: /tf_static states")
+    np.testing.assert_allclose(read.info.T_imu_lidar, whole.info.T_imu_lidar, atol=1e-12)
     for expected, scan in zip(whole.all_scans, scans, strict=True):
         assert scan.stamp_ns == expected.stamp_ns
         np.testing.assert_array_equal(scan.points, expected.points)

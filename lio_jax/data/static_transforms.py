@@ -1,0 +1,74 @@
+"""The extrinsic T_imu_lidar from the frames that a bag's /tf_static ties together."""
+
+from collections import deque
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+TOPIC = "/tf_static"
+TYPE = "tf2_msgs/msg/TFMessage"
+_DEFINITION = "geometry_msgs/TransformStamped[] transforms\n"
+
+_Array = NDArray[np.float64]
+Transforms = dict[tuple[str, str], _Array]
+"""(parent, child) -> (4, 4) T_parent_child."""
+
+
+def register_type(typestore: Any) -> None:
+    """Make the type known to a store of rosbags that was built without it."""
+    from rosbags.typesys import get_types_from_msg
+
+    if TYPE not in typestore.types:
+        typestore.register(get_types_from_msg(_DEFINITION, TYPE))
+
+
+def gathered(messages: Iterable[Any]) -> Transforms:
+    """Return the transforms of deserialised TFMessages, a later one in place of an earlier one.
+
+    One that is no rigid motion (not finite, a quaternion that is not of unit length) is left out.
+    """
+    found: Transforms = {}
+    for message in messages:
+        for stamped in message.transforms:
+            p, q = stamped.transform.translation, stamped.transform.rotation
+            position, quaternion = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
+            if not np.isfinite(position).all() or not abs(np.linalg.norm(quaternion) - 1) < 1e-2:
+                continue
+            T = np.eye(4)
+            T[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+            T[:3, 3] = position
+            found[frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id)] = T
+    return found
+
+
+def frame_name(name: str) -> str:
+    """Return a frame's name as ROS 2 and tf2 write it, without ROS 1's leading slash."""
+    return name.strip("/")
+
+
+def transform_between(transforms: Transforms, target: str, source: str) -> _Array | None:
+    """Return the (4, 4) T_target_source along the tree of frames; None where nothing connects both.
+
+    Args:
+        transforms: that are known.
+        target: frame to which points are carried.
+        source: frame in which they are given.
+    """
+    neighbours: dict[str, list[tuple[str, _Array]]] = {}
+    for (parent, child), T_parent_child in transforms.items():
+        neighbours.setdefault(parent, []).append((child, T_parent_child))
+        neighbours.setdefault(child, []).append((parent, np.linalg.inv(T_parent_child)))
+    reached = {target: np.eye(4)}
+    waiting = deque([target])
+    while waiting:
+        frame = waiting.popleft()
+        if frame == source:
+            return reached[frame]
+        for other, T_frame_other in neighbours.get(frame, []):
+            if other not in reached:
+                reached[other] = reached[frame] @ T_frame_other
+                waiting.append(other)
+    return None
