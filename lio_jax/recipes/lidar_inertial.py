@@ -16,6 +16,7 @@ from lio_jax.core.implicit import known
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
+from lio_jax.estimation.map_drift import MapDrift
 from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.imu.path import Path, deskew_along
 from lio_jax.lidar.thinning import ThinnedScan, thinned
@@ -39,7 +40,8 @@ class State(eqx.Module):
     """What is carried from scan to scan."""
 
     uncertain: Uncertain
-    """Navigation state at the last scan's end, and its covariance."""
+    """Navigation state at the last scan's end, and the covariance of its error within the map."""
+    drift: MapDrift
     prediction_error: Float[Array, ""]
     """Expected error of the next prediction, m: it opens the robust kernel."""
     scans: Int32[Array, ""]
@@ -63,6 +65,7 @@ def init(config: Config, params: Params, imu: ImuBatch) -> State:
     uncertain = levelled_start(params, imu)
     return State(
         uncertain=uncertain,
+        drift=MapDrift.none(uncertain.covariance.dtype),
         prediction_error=jnp.asarray(params.motion.initial_error, uncertain.covariance.dtype),
         scans=jnp.int32(0),
         map=empty_map(config.map.capacity),
@@ -111,8 +114,12 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
             params.map.reach.astype(jnp.float32),
         )
 
+        new = jnp.sum(added.added) / jnp.maximum(jnp.sum(thin.mask), 1)
+        drift = state.drift.carried(state.nav.T_world_imu, posterior.nav.T_world_imu)
+
     new_state = State(
         uncertain=posterior,
+        drift=drift.grown(posterior.covariance, new, state.scans),
         # it only opens the kernel, which is closed at the solution
         prediction_error=jax.lax.stop_gradient(jnp.where(first | lost, state.prediction_error, error)),
         scans=state.scans + jnp.any(thin.mask).astype(jnp.int32),
@@ -129,7 +136,7 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
         origin=frame.origin,
         thinned_away=thin.dropped,
         map_dropped=added.dropped,
-        covariance=posterior.covariance,
+        covariance=drift.added_to(posterior.covariance, posterior.nav),
         evidence=evidence_of(update, prior, evidence),
     )
 
