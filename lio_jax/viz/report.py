@@ -60,7 +60,11 @@ def _global_correction(run: RunRecord) -> str:
     rows += [("closed, but distrusted by the graph", loops["distrusted"])] if loops["distrusted"] else []
     rows += [(f"loops refused: {reason}", count) for reason, count in loops["refused"].items()]
     rows += [(f"GPS fixes: {reason}", count) for reason, count in said["gps"].items()]
-    return section("Global correction", table(("", ""), rows), figures(*run_figures.loops_closed(run)))
+    return section(
+        "Global correction",
+        table(("", ""), [(name, str(count)) for name, count in rows]),
+        figures(*run_figures.loops_closed(run)),
+    )
 
 
 def headline(run: RunRecord) -> dict[str, str]:

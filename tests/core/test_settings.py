@@ -62,6 +62,8 @@ def values_for(path: str) -> st.SearchStrategy:
         return st.integers(1, 24).map(lambda bits: 2**bits)
     if path == "config.knn.neighbours":
         return st.integers(3, 100)
+    if path == "config.lio_sam.window":
+        return st.integers(2, 1000)
     if path == "config.features.neighbours":
         return st.integers(1, 100)
     if path == "config.features.columns":
