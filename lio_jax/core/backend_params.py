@@ -17,6 +17,43 @@ class BackendParams(eqx.Module):
     """Of the first keyframe's roll and pitch, rad, where GPS ties the trajectory to the world."""
 
 
+class LoopParams(eqx.Module):
+    """Places that are seen again: which are compared, and what has to hold before a loop is closed."""
+
+    radius: Scalar
+    """The nearest earlier keyframe within this distance is compared, m ..."""
+    time_gap: Scalar
+    """... if it is older than this, s."""
+    drift: Scalar
+    """Largest error of position that the odometry may have gathered, m per m run."""
+    heading_drift: Scalar
+    """Likewise of heading, rad per m run."""
+    tilt: Scalar
+    """Largest error of roll and pitch that a loop may correct, rad."""
+    descriptor_range: Scalar
+    """Farthest points that describe a place, m."""
+    descriptor_distance: Scalar
+    """Places whose descriptors differ by more than this are not compared, 0 to 1."""
+    aligning_voxel: Scalar
+    """Of the map that a scan is aligned with in the end, m; at first it is twice this."""
+    overlap_distance: Scalar
+    """A point agrees with the map if the map has a point nearer than this, m."""
+    overlap: Scalar
+    """Least share of points of upright things that agree."""
+    fitness: Scalar
+    """Largest mean squared distance to the map of the points that have it near, m^2."""
+    conflict: Scalar
+    """Largest share of the map's upright things that stand where the scan saw through."""
+    rival: Scalar
+    """No other alignment may agree with more than this share of the points that agree with the best."""
+    rotation_sigma: Scalar
+    """What a loop's rotation is believed with at best, rad."""
+    translation_sigma: Scalar
+    """Likewise its translation, m."""
+    support_reach: Scalar
+    """Loops confirm or contradict each other if both ends are no farther apart than this, m run."""
+
+
 class GpsParams(eqx.Module):
     """Which GPS fixes tie the trajectory to the earth, and how far they are trusted."""
 

@@ -98,7 +98,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "tilt": 0.1,
         "descriptor_range": 60.0,
         "descriptor_distance": 0.5,
-        "voxel_size": 1.2,
+        "aligning_voxel": 1.2,
         "overlap_distance": 0.5,
         "overlap": 0.7,
         "fitness": 0.12,

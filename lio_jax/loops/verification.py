@@ -104,7 +104,7 @@ def verify(proposal: Proposal, keyframes: Sequence[Keyframe], poses: _Array, set
         *padded(ours, sizes.source_points),
         _guesses(found, stations),
         sizes.starts,
-        _params(limits["voxel_size"], state_dtype()),
+        _params(limits["aligning_voxel"], state_dtype()),
     )
     comparison = Comparison(theirs, stations, ours[our_upright], limits["overlap_distance"])
     candidates = comparison.candidates(result, poses[[target, source]])
