@@ -60,7 +60,8 @@ def transform_between(transforms: Transforms, target: str, source: str) -> _Arra
     neighbours: dict[str, list[tuple[str, _Array]]] = {}
     for (parent, child), T_parent_child in transforms.items():
         neighbours.setdefault(parent, []).append((child, T_parent_child))
-        neighbours.setdefault(child, []).append((parent, np.linalg.inv(T_parent_child)))
+        T_child_parent: _Array = np.linalg.inv(T_parent_child).astype(np.float64)
+        neighbours.setdefault(child, []).append((parent, T_child_parent))
     reached = {target: np.eye(4)}
     waiting = deque([target])
     while waiting:
