@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -186,7 +187,7 @@ def test_the_command_writes_where_it_is_told(folder, tmp_path, capsys):
 
 
 @needs_browser
-def test_a_browser_shows_the_page_and_asks_for_nothing(folder, tmp_path):
+def test_a_browser_shows_the_page_and_asks_for_nothing(folder, tmp_path, pictures):
     from matplotlib.image import imread
 
     page = opened(write_report(folder), tmp_path)
@@ -194,6 +195,7 @@ def test_a_browser_shows_the_page_and_asks_for_nothing(folder, tmp_path):
     assert page.requested == []
     assert page.document.count("<figure") == page.document.count("</svg>") == len(FIGURES)
     picture = imread(page.picture)
+    shutil.copy(page.picture, pictures / "report.png")
     # the map's figure, in the page's upper half: paper, grid, points, two coloured ways
     assert len(np.unique((picture[600:1200, :, :3] * 31).astype(int).reshape(-1, 3), axis=0)) > 20
 

@@ -10,6 +10,7 @@ import time
 import urllib.request
 from pathlib import Path
 
+import matplotlib.image
 import numpy as np
 import pytest
 
@@ -18,6 +19,7 @@ from lio_jax.core.errors import LioJaxError
 from lio_jax.viz import viewer
 from lio_jax.viz.recording import Recording
 from lio_jax.viz.viewer import served
+from tests.viz.browser import needs_browser, seen
 
 
 def short(path: Path, live: str | None = None) -> Path:
@@ -56,6 +58,31 @@ def test_a_recording_is_served_on_loopback_and_no_longer_than_the_block(tmp_path
     for port in ports:
         with socket.socket() as probe:
             assert probe.connect_ex(("127.0.0.1", port)) != 0
+
+
+def coloured(picture: np.ndarray) -> float:
+    """Return the share of the world's view that is red."""
+    height, width, _ = picture.shape
+    red, green, blue = np.moveaxis(picture[height // 8 :, : 2 * width // 3], -1, 0)
+    return float(np.mean((red > 0.6) & (green < 0.4) & (blue < 0.4)))
+
+
+@needs_browser
+def test_a_browser_draws_the_world(tmp_path, pictures):
+    """A fence of refused loops fills a good part of the canvas, on which nothing else is red."""
+    fence = np.zeros((400, 2, 3))
+    fence[:, :, 1] = np.linspace(-6, 6, 400)[:, None]
+    fence[:, :, 2] = [-4, 4]
+    with Recording(tmp_path / "recording.rrd", scan_count=2) as recording:
+        for index in range(2):
+            recording.log_scan(index, index, fence[:, 0].astype(np.float32), np.eye(4))
+            recording.log_correction(
+                fence[:2, 0], fence[:2, 0], {"closed": np.zeros((0, 2, 3)), "refused": fence}
+            )
+    with served(tmp_path / "recording.rrd") as server:
+        picture = seen(server.page, tmp_path, lambda picture: coloured(picture) > 0.02, 90.0)
+    matplotlib.image.imsave(pictures / "viewer.png", picture)
+    assert coloured(picture) > 0.02
 
 
 def test_a_live_recording_reaches_the_server_and_the_file(tmp_path):
