@@ -175,7 +175,21 @@ def town(
         spacing: of the keyframes, m.
         speed: m/s.
     """
-    from simulated_keyframes import drifted, driven, keyframes_of, rounded, times_along
+    from simulated_keyframes import drifted, keyframes_of, times_along
+
+    from lio_jax.sim.world_registry import build
+
+    truth = lap_twice(name, seed, again, aside, loop, spacing)
+    odometry = drifted(truth, scale=0.01, heading=1.2e-4, noise=0.02, seed=seed)
+    world = build(name, seed).world
+    return keyframes_of(world, truth, odometry, times_along(truth, speed), seed=seed), truth
+
+
+def lap_twice(
+    name: str, seed: int, again: float = 1.0, aside: float = 0.0, loop: Any = None, spacing: float = 1.0
+) -> np.ndarray:
+    """Return the true poses (k, 4, 4) of :func:`town`."""
+    from simulated_keyframes import driven, rounded
 
     from lio_jax.sim.blocks import LANE, PITCH
     from lio_jax.sim.blocks import lap as lap_of
@@ -186,9 +200,7 @@ def town(
     path = rounded(np.array(loop or _LOOP) * PITCH - lap_of()[0], spacing=spacing)
     first = driven(world, path, -LANE)
     second = driven(world, path if again > 0 else path[::-1], aside - LANE)
-    truth = np.concatenate([first, second])
-    odometry = drifted(truth, scale=0.01, heading=1.2e-4, noise=0.02, seed=seed)
-    return keyframes_of(world, truth, odometry, times_along(truth, speed), seed=seed), truth
+    return np.concatenate([first, second])
 
 
 def tunnel(spacing: float = 1.0) -> Drive:

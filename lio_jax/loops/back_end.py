@@ -25,8 +25,9 @@ from lio_jax.loops.verification import Verdict
 
 _Array = NDArray[np.float64]
 
-_SOLVE_EVERY = 20
-"""Keyframes from one solve to the next, while loops and fixes come in that agree with the poses."""
+_SOLVE_EVERY, _SOLVE_SHARE = 20, 0.05
+"""Keyframes from one solve to the next while loops and fixes come in that agree with the poses, and as a
+share of all: the work of a drive stays nearly linear in its length."""
 _UNKNOWN_YAW, _UNKNOWN_POSITION = np.pi, 1e4
 """Sigmas of the first pose on the earth, rad and m, as in LIO-SAM; fixes tell both."""
 
@@ -98,7 +99,9 @@ class BackEnd:
         self._append(keyframe)
         surprised = self._close_loops(self._closer) if self._closer else False
         surprised |= self._tie_to_earth(self._gate) if self._gate else False
-        if surprised or (self._unsolved and len(self._keyframes) >= self._solved_at + _SOLVE_EVERY):
+        count = len(self._keyframes)
+        due = count >= self._solved_at + max(_SOLVE_EVERY, _SOLVE_SHARE * count)
+        if surprised or (self._unsolved and due):
             self._solve()
 
     def settle(self) -> None:
