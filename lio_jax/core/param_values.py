@@ -76,6 +76,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "radius": 50.0,
         "spacing": 2.0,
         "recent": 10.0,
+        "min_corners": 10.0,
+        "min_surfaces": 100.0,
     },
     "smoother": {
         "rotation_sigma": 0.05,
@@ -156,6 +158,8 @@ _MAY_BE_ZERO = {
     "point_map.nearer_by",
     "submap.spacing",
     "submap.recent",
+    "submap.min_corners",
+    "submap.min_surfaces",
     "smoother.tilt_weight",
     "smoother.mapping_interval",
     "motion.initial_error",

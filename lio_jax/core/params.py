@@ -196,6 +196,10 @@ class SubmapParams(eqx.Module):
     """... but one per so many metres only; the others' places are taken ..."""
     recent: Scalar
     """... once they are older than this, s."""
+    min_corners: Scalar
+    """A scan with fewer corners is not matched, nor one ..."""
+    min_surfaces: Scalar
+    """... with fewer surface points."""
 
 
 class SmootherParams(eqx.Module):

@@ -27,7 +27,7 @@ _SAME_AXES = 0.02
 _FROM_NAVSAT = "odometry/gps"
 
 _OUTPUT = "names or draws what its nodes publish; a run writes a folder"
-_NO_LOOPS = "a run closes no loops"
+_WITH_LOOPS = "counts where loops are closed: config.backend.loops=true"
 _WITH_GPS = "counts where fixes are used: config.backend.gps=true"
 
 
@@ -77,10 +77,6 @@ def _sensor(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str
     return {"config.features.order": order}, word
 
 
-def _fixed(what: str, value: int) -> Rule:
-    return nothing(f"the recipe lio_sam matches scans of at least {value} {what}")
-
-
 def _of_method(path: str, word: str = "") -> Rule:
     return same(path, word=word, method=True)
 
@@ -118,8 +114,8 @@ LIO_SAM = System(
         "extrinsicRPY": Rule(_extrinsic_rpy),
         "edgeThreshold": _of_method("params.features.corner_threshold"),
         "surfThreshold": _of_method("params.features.flat_threshold"),
-        "edgeFeatureMinValidNum": _fixed("corners", 10),
-        "surfFeatureMinValidNum": _fixed("surface points", 100),
+        "edgeFeatureMinValidNum": _of_method("params.submap.min_corners"),
+        "surfFeatureMinValidNum": _of_method("params.submap.min_surfaces"),
         "odometrySurfLeafSize": _of_method("params.features.surface_spacing"),
         "mappingCornerLeafSize": _of_method("params.map.corner_voxel_size"),
         "mappingSurfLeafSize": _of_method("params.map.voxel_size"),
@@ -134,18 +130,13 @@ LIO_SAM = System(
         "surroundingkeyframeAddingAngleThreshold": _of_method("params.submap.keyframe_angle"),
         "surroundingKeyframeDensity": _of_method("params.submap.spacing"),
         "surroundingKeyframeSearchRadius": _of_method("params.submap.radius"),
-        **dict.fromkeys(
-            (
-                "loopClosureEnableFlag",
-                "loopClosureFrequency",
-                "surroundingKeyframeSize",
-                "historyKeyframeSearchRadius",
-                "historyKeyframeSearchTimeDiff",
-                "historyKeyframeSearchNum",
-                "historyKeyframeFitnessScore",
-            ),
-            nothing(_NO_LOOPS),
-        ),
+        "loopClosureEnableFlag": _of_method("config.backend.loops"),
+        "historyKeyframeSearchRadius": _of_method("params.loop.radius", _WITH_LOOPS),
+        "historyKeyframeSearchTimeDiff": _of_method("params.loop.time_gap", _WITH_LOOPS),
+        "historyKeyframeSearchNum": _of_method("config.loops.submap_keyframes", _WITH_LOOPS),
+        "historyKeyframeFitnessScore": nothing("params.loop.* has tests of its own for a loop"),
+        "loopClosureFrequency": nothing("every keyframe is compared, beside the odometry"),
+        "surroundingKeyframeSize": nothing("params.submap.* says which keyframes are matched with"),
         **dict.fromkeys(
             (
                 "globalMapVisualizationSearchRadius",

@@ -45,9 +45,6 @@ from lio_jax.registration.lines_and_planes import FeaturePoints
 from lio_jax.registration.rounds import match_in_rounds
 from lio_jax.registration.submap import ScanToSubmap, Submap, with_scan
 
-_LEAST_CORNERS, _LEAST_SURFACES = 10, 100
-"""Below these a scan is not matched."""
-
 
 class State(eqx.Module):
     """What is carried from scan to scan."""
@@ -139,7 +136,8 @@ def step(
         features = in_single_precision(lio_sam_features, config, params, scan)
         room = config.lio_sam.corner_points, config.lio_sam.surface_points
         corner, surface, thinned_away = thinned_features(features.corner, features.surface, params, *room)
-        enough = (jnp.sum(corner.mask) >= _LEAST_CORNERS) & (jnp.sum(surface.mask) >= _LEAST_SURFACES)
+        least = params.submap.min_corners, params.submap.min_surfaces
+        enough = (jnp.sum(corner.mask) >= least[0]) & (jnp.sum(surface.mask) >= least[1])
         # a first scan that is too poor would be a map in which nothing is ever found
         seen = jnp.where(first, enough, jnp.any(features.surface.mask))
     with jax.named_scope("predict"):
