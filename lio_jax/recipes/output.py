@@ -47,7 +47,7 @@ class Output(eqx.Module):
     corners: Bool[Array, " m"] | None = None
     """Which of ``points`` are corners, the others being surfaces; None from recipes without features."""
     covariance: Float[Array, "24 24"] | None = None
-    """Of the navigation state's error; None from recipes that carry none."""
+    """Of the navigation state's error in the world; None from recipes that carry none."""
     evidence: Evidence | None = None
     """None from recipes that carry no covariance."""
     log_evidence: Float[Array, ""] | None = None

@@ -88,7 +88,8 @@ class TrajectoryLog:
         - ``extrinsic`` (n, 4, 4) T_imu_lidar;
         - ``time_offset`` (n,) s: a scan stamped t was taken at IMU time t + time_offset;
         - ``covariance`` (n, 6, 6) of the pose's right perturbation (rotation rad, position m): the filter's,
-          in LiDAR odometry that of the match with the map alone, NaN where unknown;
+          which in the recipe default holds the drift of the map, too; in LiDAR odometry that of the match
+          with the map alone, NaN where unknown;
         - ``state_covariance`` (n, 24, 24) of the whole error state, from filters only;
         - ``nis``, ``nis_dof`` (n,) normalised innovation squared and its degrees of freedom, 0 without.
         """
