@@ -23,6 +23,7 @@ from lio_jax.loops.gps import GpsGate
 from lio_jax.loops.graph import LOOP, ODOMETRY
 from lio_jax.loops.surroundings import thinned
 from lio_jax.run.beside import BesideOdometry
+from lio_jax.run.cloud_file import read_cloud
 from lio_jax.run.folder import write_json
 from lio_jax.run.keyframe_store import KeyframeWriter, read_keyframes
 from lio_jax.run.keyframes import KeyframePicker, corner_marks
@@ -64,8 +65,10 @@ class GlobalCorrection:
             self._store.append(keyframe.points, corner_marks(tracked))
             self._beside.add(replace(keyframe, points=thinned(keyframe.points, _KEPT_SPACING)))
 
-    def finish(self, odometry: Trajectory, hurry: bool) -> tuple[Trajectory, dict[str, Any]]:
-        """Write the corrected results and return the corrected trajectory and what metrics.json says.
+    def finish(
+        self, odometry: Trajectory, hurry: bool
+    ) -> tuple[Trajectory, NDArray[np.float32] | None, dict[str, Any]]:
+        """Write the corrected results; return the corrected trajectory and map, and what metrics.json says.
 
         Args:
             odometry: T_odom_imu of all scans.
@@ -73,7 +76,7 @@ class GlobalCorrection:
         """
         found = self._beside.finish(hurry)
         if not len(found.stamp_ns):
-            return odometry, self._said(found)
+            return odometry, None, self._said(found)
         poses = corrected_poses(
             odometry.stamp_ns, odometry.poses, found.stamp_ns, found.T_odom_imu, found.T_world_imu
         )
@@ -84,9 +87,8 @@ class GlobalCorrection:
         write_json(self._out / "loops.json", {"loops": [_loop(found, *one) for one in found.loops]})
         if found.T_enu_world is not None:
             write_json(self._out / "georeference.json", _georeference(found.T_enu_world, self._origin))
-        if self._settings.config.output.map:
-            self._write_map()
-        return Trajectory(odometry.stamp_ns, poses), self._said(found)
+        map_points = self._written_map() if self._settings.config.output.map else None
+        return Trajectory(odometry.stamp_ns, poses), map_points, self._said(found)
 
     def _gate(self, sequence: Sequence, settings: Settings) -> GpsGate:
         recorded = sequence.gps()
@@ -107,7 +109,7 @@ class GlobalCorrection:
         rows = np.searchsorted(odometry.stamp_ns, stamps)
         return stamps, poses[rows], odometry.poses[rows]
 
-    def _write_map(self) -> None:
+    def _written_map(self) -> NDArray[np.float32]:
         """Put the keyframes' clouds where the keyframes were found to be."""
         spacing = self._settings.values["map"]["point_spacing"]
         with tempfile.TemporaryDirectory(prefix=".tiles.", dir=self._out) as folder:
@@ -115,6 +117,7 @@ class GlobalCorrection:
             for T_world_imu, points in read_keyframes(self._out).clouds():
                 tiles.add(T_world_imu, points)
             tiles.write(self._out / "map.pcd")
+        return read_cloud(self._out / "map.pcd")
 
     def _said(self, found: Correction) -> dict[str, Any]:
         weights = [weight for _, weight in found.loops if weight is not None]

@@ -54,7 +54,9 @@ class RunResult:
     """What metrics.json holds."""
     stage_ms: dict[str, list[float]]
     """Time of each stage for each scan."""
-    odometry: Trajectory | None
+    map_points: NDArray[np.float32] | None
+    """(n, 3) m in world; None where no map was asked for."""
+    odometry: Trajectory | None = None
     """As it was before the back end corrected it; None without one."""
     interruption: BaseException | None = None
     """What ended the run early, where something did."""
@@ -149,13 +151,12 @@ def run_sequence(
                 raise interruption
             reasons = " ".join(sequence.warnings_so_far)
             raise LioJaxError(f"{sequence.info.path}: no scan could be read. {reasons}".strip())
-        if map_file:
-            map_file.finish()
+        map_points = map_file.finish() if map_file else None
         trajectory = log.trajectory()
         _write_keyframes(out, log, settings)
         corrected: dict[str, Any] = {}
         if correction:
-            trajectory, corrected = correction.finish(trajectory, hurry=interruption is not None)
+            trajectory, map_points, corrected = correction.finish(trajectory, interruption is not None)
         _write_trajectory(out, log, trajectory, settings)
         scan_log.write_npz(out / "scans.npz", stage_ms)
         if imu and imu.samples:
@@ -184,8 +185,14 @@ def run_sequence(
         "environment": environment(),
     }
     write_json(out / "metrics.json", metrics)
-    odometry = log.trajectory() if correction else None
-    return RunResult(trajectory, metrics, stage_ms, odometry, interruption)
+    return RunResult(
+        trajectory=trajectory,
+        metrics=metrics,
+        stage_ms=stage_ms,
+        map_points=map_points,
+        odometry=log.trajectory() if correction else None,
+        interruption=interruption,
+    )
 
 
 def imu_feed(sequence: Sequence, settings: Settings) -> tuple[ImuFeed | None, tuple[str, ...]]:

@@ -95,7 +95,7 @@ def twice_around_a_block():
 
 def test_a_loop_driven_twice_is_closed_wherever_it_is_driven_again(twice_around_a_block):
     keyframes, truth = twice_around_a_block
-    closer, _ = closed(keyframes)
+    closer, _, _ = closed(keyframes)
     again = set(revisits(keyframes, truth).tolist())
     loops = closer.closed
     assert len(again) > 60

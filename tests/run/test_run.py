@@ -10,7 +10,6 @@ import pytest
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.core.settings import with_overrides
 from lio_jax.data.trajectory import read_tum
-from lio_jax.run.cloud_file import read_cloud
 from lio_jax.run.run import run_sequence, settings_for
 from tests.run.small_drive import COUNT, Replay, moving, without_points
 
@@ -126,13 +125,14 @@ def test_first_pose_is_certain_and_the_others_are_known(tmp_path, settings):
 
 
 def test_without_a_map_there_is_no_map(tmp_path, settings):
-    run_sequence(Replay(moving()), with_overrides(settings, ["config.output.map=false"]), tmp_path)
+    result = run_sequence(Replay(moving()), with_overrides(settings, ["config.output.map=false"]), tmp_path)
+    assert result.map_points is None
     assert not (tmp_path / "map.pcd").exists()
 
 
 def test_map_points_lie_on_the_world(tmp_path, settings):
-    run_sequence(Replay(moving()), settings, tmp_path)
-    points = read_cloud(tmp_path / "map.pcd")
+    points = run_sequence(Replay(moving()), settings, tmp_path).map_points
+    assert points is not None
     assert len(points) > 5000
     # the street is flat and the body frame starts 1.5 m above it
     ground = points[np.abs(points[:, 2] + 1.5) < 0.3]
