@@ -111,9 +111,9 @@ class BackEnd:
 
     def correction(self) -> Correction:
         """Return the correction of all keyframes so far, as the last solve left it."""
-        T_world = np.eye(4)
+        T_world_enu = np.eye(4)
         if self._keyframes and self._aligned:
-            T_world = levelled_onto(self._poses[0], self._keyframes[0].T_odom_imu)
+            T_world_enu = levelled_onto(self._poses[0], self._keyframes[0].T_odom_imu)
         weights = np.ones(len(self._edges))
         weights[: len(self._weights)] = self._weights
         fixes: dict[str, int] = {}
@@ -122,12 +122,12 @@ class BackEnd:
         return Correction(
             stamp_ns=np.array([keyframe.stamp_ns for keyframe in self._keyframes], np.int64),
             T_odom_imu=np.array([keyframe.T_odom_imu for keyframe in self._keyframes]).reshape(-1, 4, 4),
-            T_world_imu=T_world @ self._poses,
+            T_world_imu=T_world_enu @ self._poses,
             edges=self._edges,
             weights=weights,
             loops=self._outcomes(weights),
             fixes=fixes,
-            T_enu_world=_inverse(T_world) if self._aligned else None,
+            T_enu_world=_inverse(T_world_enu) if self._aligned else None,
         )
 
     def _append(self, keyframe: Keyframe) -> None:

@@ -18,9 +18,10 @@ from lio_jax.data.trajectory import Trajectory, ns_to_seconds, write_tum
 from lio_jax.loops.back_end import BackEnd, Correction
 from lio_jax.loops.closing import LoopCloser
 from lio_jax.loops.drift_correction import corrected_poses
-from lio_jax.loops.g2o import Edge, write_g2o
+from lio_jax.loops.g2o import write_graph
 from lio_jax.loops.gps import GpsGate
-from lio_jax.loops.graph import LOOP, ODOMETRY
+from lio_jax.loops.graph import LOOP, ODOMETRY, PoseGraph
+from lio_jax.loops.keyframe_graph import graph_of
 from lio_jax.loops.surroundings import thinned
 from lio_jax.run.beside import BesideOdometry
 from lio_jax.run.cloud_file import read_cloud
@@ -83,7 +84,7 @@ class GlobalCorrection:
         self._store.finish(*self._of_all_stored(found, odometry, poses))
         with atomic_path(self._out / "odometry.tum") as aside:
             write_tum(aside, odometry)
-        write_g2o(self._out / "keyframes.g2o", found.T_world_imu, _graph(found))
+        write_graph(self._out / "keyframes.g2o", _graph(found), np.arange(len(found.stamp_ns)))
         write_json(self._out / "loops.json", {"loops": [_loop(found, *one) for one in found.loops]})
         if found.T_enu_world is not None:
             write_json(self._out / "georeference.json", _georeference(found.T_enu_world, self._origin))
@@ -142,13 +143,14 @@ class GlobalCorrection:
         return (*self.notes, *((ended,) if error else ()))
 
 
-def _graph(found: Correction) -> list[Edge]:
-    """Return odometry and loops as g2o tells them, information by the weight they were given."""
-    return [
-        Edge(edge.i, edge.j, edge.measured, edge.information * max(weight, 1e-9))
+def _graph(found: Correction) -> PoseGraph:
+    """Return odometry and loops, which g2o can tell, their information by the weight they were given."""
+    edges = [
+        replace(edge, information=edge.information * max(weight, 1e-9))
         for edge, weight in zip(found.edges, found.weights, strict=True)
         if edge.kind in (ODOMETRY, LOOP)
     ]
+    return graph_of(found.T_world_imu, edges)
 
 
 def _loop(found: Correction, verdict: Any, weight: float | None) -> dict[str, Any]:

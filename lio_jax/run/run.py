@@ -153,11 +153,13 @@ def run_sequence(
             raise LioJaxError(f"{sequence.info.path}: no scan could be read. {reasons}".strip())
         map_points = map_file.finish() if map_file else None
         trajectory = log.trajectory()
-        _write_keyframes(out, log, settings)
+        _write_trajectory(out, log, trajectory)
+        _write_states(out, log, settings)
         corrected: dict[str, Any] = {}
         if correction:
+            # over what is written already, so that a failure here loses none of it
             trajectory, map_points, corrected = correction.finish(trajectory, interruption is not None)
-        _write_trajectory(out, log, trajectory, settings)
+            _write_trajectory(out, log, trajectory)
         scan_log.write_npz(out / "scans.npz", stage_ms)
         if imu and imu.samples:
             write_imu_rate(out / "imu_rate.tum", log, imu.samples)
@@ -251,20 +253,20 @@ def peak_rss_mb() -> float:
     return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)
 
 
-def _write_trajectory(out: Path, log: TrajectoryLog, trajectory: Trajectory, settings: Settings) -> None:
+def _write_trajectory(out: Path, log: TrajectoryLog, trajectory: Trajectory) -> None:
     with atomic_path(out / "trajectory.tum") as aside:
         write_tum(aside, trajectory)
     with atomic_path(out / "trajectory_kitti.txt") as aside:
         write_kitti_poses(aside, trajectory.poses @ log.column("extrinsic"))
+
+
+def _write_states(out: Path, log: TrajectoryLog, settings: Settings) -> None:
     log.write_npz(out / "states.npz")
-    write_text(out / "config.yaml", settings.to_yaml())
-
-
-def _write_keyframes(out: Path, log: TrajectoryLog, settings: Settings) -> None:
     output, trajectory = settings.config.output, log.trajectory()
     chosen = keyframe_indices(trajectory.poses, output.keyframe_distance, output.keyframe_angle)
     poses = trajectory.poses[chosen]
     write_g2o(out / "keyframes.g2o", poses, odometry_edges(poses, log.match_covariances()[chosen]))
+    write_text(out / "config.yaml", settings.to_yaml())
 
 
 def _timed(scans: Iterator[LidarScan], decode_ms: list[float]) -> Iterator[LidarScan]:
