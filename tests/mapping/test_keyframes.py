@@ -8,11 +8,11 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.core.params import SubmapParams
+from lio_jax.core.params import default_params
 from lio_jax.mapping.keyframes import KeyframeCloud, is_due, next_to_enter, no_keyframes, with_keyframe
 
 CORNERS, SURFACES = 8, 16
-PARAMS = SubmapParams(*(jnp.asarray(value) for value in (1.0, 0.2, 50.0, 2.0, 10.0)))
+PARAMS = default_params().submap
 _add = jax.jit(partial(with_keyframe, params=PARAMS))
 _enter = jax.jit(partial(next_to_enter, params=PARAMS))
 
