@@ -1,7 +1,7 @@
 """Find known noise again without ground truth, and judge it on recordings that it was not tuned on.
 
     python experiments/tune_noise.py [--worlds street city] [--seeds 0 1 2] [--held-out 100 101 102]
-        [--seconds 20] [--factors 10 0.1] [--objectives noise] [--iterations 28] [--simplex] [--json FILE]
+        [--seconds 20] [--factors 10 0.1] [--objectives noise] [--iterations 40] [--simplex] [--json FILE]
 
 Simulates recordings of a MEMS sensor, starts with all noise FACTOR times its true value and tunes on each
 recording by itself. Tables: what was found over what is true; what the tuned filter says of itself on the
@@ -201,7 +201,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--factors", nargs="+", type=float, default=[10.0, 0.1])
     parser.add_argument("--objectives", nargs="+", default=["noise"])
-    parser.add_argument("--iterations", type=int, default=28)
+    parser.add_argument("--iterations", type=int, default=40)
     parser.add_argument("--simplex", action="store_true")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()

@@ -88,8 +88,6 @@ class PointNoise(eqx.Module):
     """From the sensor, in world axes, m."""
     distance: Float[Array, " k"]
     """Along the plane's normal, m; zero where there is no match."""
-    facing: Float[Array, " k"]
-    """Cosine of incidence."""
     variance: Float[Array, " k"]
     """Of the distance, m^2; one where there is no match."""
     precision: Float[Array, " k"]
@@ -126,11 +124,9 @@ def point_noise(
     variances = own[:, None] + matches.variances
     known = 1 / variances
     distance = jnp.sum(matches.normal * (placed - matches.mean), -1)
-    far = jnp.where(matches.used, range_squared, 1.0)
     return PointNoise(
         arm=arm,
         distance=jnp.where(matches.used, distance, 0.0),
-        facing=jnp.abs(along) / jnp.sqrt(far),
         variance=jnp.where(matches.used, variances[:, 0], 1.0),
         precision=jnp.where(matches.used, known[:, 0] - known[:, 1], 0.0),
     )
