@@ -32,7 +32,8 @@ DENSITIES = {
 }
 RANGE_SIGMA = 0.02
 TRUE = {**{f"imu.{name}": value for name, value in DENSITIES.items()}, "lidar.range_sigma": RANGE_SIGMA}
-TUNED = (*TRUE, "registration.information_scale")
+SURFACE = "lidar.surface_sigma"
+TUNED = (*TRUE, SURFACE, "registration.information_scale")
 BLOCKS = {"pose": slice(0, 6), "velocity": slice(6, 9), "biases": slice(9, 15)}
 SETTLED = 20
 """Scans until the start has been forgotten."""
@@ -71,7 +72,9 @@ class Workshop:
         self.seconds = seconds
         self._recordings: dict[tuple[str, int], Any] = {}
         self.settings = self._settings(self._sequence(world, 0))
-        self.free = free_parameters(self.settings.params(), TUNED)
+        self.free = free_parameters(
+            with_overrides(self.settings, [f"params.{SURFACE}={RANGE_SIGMA}"]).params(), TUNED
+        )
         named = objective_named(objective)
         arguments = (self.settings.recipe, self.settings.config, self.free, named.objective)
         self.loss, self.values = Loss(*arguments), StreamingValues(*arguments)
@@ -87,11 +90,11 @@ class Workshop:
         return self._recordings[world, seed]
 
     def start(self, factor: float) -> np.ndarray:
-        """Return all noise at ``factor`` times its true value."""
+        """Return all noise at ``factor`` times its true value, the surfaces' at that of the ranges."""
         x = np.asarray(self.free.first()).copy()
         for place, name in enumerate(self.free.names):
-            if name in TRUE:
-                x[place] = np.log(TRUE[name] * factor)
+            if name in TRUE or name == SURFACE:
+                x[place] = np.log(TRUE.get(name, RANGE_SIGMA) * factor)
         return x
 
     def tuned(self, world: str, seed: int, factor: float, iterations: int) -> Found:

@@ -40,7 +40,7 @@ def point_evidence(
     noise = point_noise(matches, points, T_world_lidar, frame, params)
     kernel = params.registration.kernel.astype(points.dtype)
     # as in iteratively reweighted least squares, the weights are no part of the derivative
-    weight = jax.lax.stop_gradient(noise.weight(kernel, params.lidar.range_sigma.astype(points.dtype)))
+    weight = jax.lax.stop_gradient(noise.weight(kernel))
     sums = jnp.stack(
         [
             jnp.sum(weight * noise.precision * noise.distance**2),
