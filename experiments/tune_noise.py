@@ -64,6 +64,7 @@ class Workshop:
     """Recordings and compiled programs, shared by all tunings of one objective."""
 
     def __init__(self, seconds: float, objective: str, world: str) -> None:
+        from lio_jax.core.settings import with_overrides
         from lio_jax.tuning.loss import Loss
         from lio_jax.tuning.named_objectives import objective_named
         from lio_jax.tuning.parameters import free_parameters
@@ -72,9 +73,8 @@ class Workshop:
         self.seconds = seconds
         self._recordings: dict[tuple[str, int], Any] = {}
         self.settings = self._settings(self._sequence(world, 0))
-        self.free = free_parameters(
-            with_overrides(self.settings, [f"params.{SURFACE}={RANGE_SIGMA}"]).params(), TUNED
-        )
+        above_zero = with_overrides(self.settings, [f"params.{SURFACE}={RANGE_SIGMA}"])
+        self.free = free_parameters(above_zero.params(), TUNED)
         named = objective_named(objective)
         arguments = (self.settings.recipe, self.settings.config, self.free, named.objective)
         self.loss, self.values = Loss(*arguments), StreamingValues(*arguments)
@@ -220,7 +220,7 @@ def tables(objective: str, options: argparse.Namespace) -> dict[str, Any]:
     shop = Workshop(options.seconds, objective, options.worlds[0])
     names = [name.split(".")[1] for name in shop.free.names]
     true = np.array([np.log(TRUE.get(name, 1.0)) for name in shop.free.names])
-    print(f"\nobjective {objective}: found / true [95 % interval]; information_scale as it is")
+    print(f"\nobjective {objective}: found / true [95 % interval]; surface (m) and scale as they are")
     print(f"{'world':8}{'seed':>5}{'start':>7}" + "".join(f"{name:>28}" for name in names) + f"{'s':>7}")
     found: list[Found] = []
     rows: list[dict[str, Any]] = []
