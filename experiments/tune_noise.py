@@ -1,7 +1,7 @@
 """Find known noise again without ground truth, and judge it on recordings that it was not tuned on.
 
     python experiments/tune_noise.py [--worlds street city] [--seeds 0 1 2] [--held-out 100 101 102]
-        [--seconds 20] [--factors 10 0.1] [--objectives noise] [--iterations 40] [--simplex] [--json FILE]
+        [--seconds 20] [--factors 10 0.1] [--objectives noise] [--iterations 40] [--surface] [--simplex] [--json FILE]
 
 Simulates recordings of a MEMS sensor, starts with all noise FACTOR times its true value and tunes on each
 recording by itself. Tables: what was found over what is true; what the tuned filter says of itself on the
@@ -33,7 +33,7 @@ DENSITIES = {
 RANGE_SIGMA = 0.02
 TRUE = {**{f"imu.{name}": value for name, value in DENSITIES.items()}, "lidar.range_sigma": RANGE_SIGMA}
 SURFACE = "lidar.surface_sigma"
-TUNED = (*TRUE, SURFACE, "registration.information_scale")
+TUNED = (*TRUE, "registration.information_scale")
 BLOCKS = {"pose": slice(0, 6), "velocity": slice(6, 9), "biases": slice(9, 15)}
 SETTLED = 20
 """Scans until the start has been forgotten."""
@@ -63,7 +63,7 @@ class Judged:
 class Workshop:
     """Recordings and compiled programs, shared by all tunings of one objective."""
 
-    def __init__(self, seconds: float, objective: str, world: str) -> None:
+    def __init__(self, seconds: float, objective: str, world: str, surface: bool = False) -> None:
         from lio_jax.core.settings import with_overrides
         from lio_jax.tuning.loss import Loss
         from lio_jax.tuning.named_objectives import objective_named
@@ -73,8 +73,8 @@ class Workshop:
         self.seconds = seconds
         self._recordings: dict[tuple[str, int], Any] = {}
         self.settings = self._settings(self._sequence(world, 0))
-        above_zero = with_overrides(self.settings, [f"params.{SURFACE}={RANGE_SIGMA}"])
-        self.free = free_parameters(above_zero.params(), TUNED)
+        start = with_overrides(self.settings, [f"params.{SURFACE}={RANGE_SIGMA}"] if surface else [])
+        self.free = free_parameters(start.params(), (*TUNED, SURFACE) if surface else TUNED)
         named = objective_named(objective)
         arguments = (self.settings.recipe, self.settings.config, self.free, named.objective)
         self.loss, self.values = Loss(*arguments), StreamingValues(*arguments)
@@ -205,6 +205,7 @@ def main() -> None:
     parser.add_argument("--factors", nargs="+", type=float, default=[10.0, 0.1])
     parser.add_argument("--objectives", nargs="+", default=["noise"])
     parser.add_argument("--iterations", type=int, default=40)
+    parser.add_argument("--surface", action="store_true", help=f"tune {SURFACE} too")
     parser.add_argument("--simplex", action="store_true")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
@@ -217,7 +218,7 @@ def main() -> None:
 
 def tables(objective: str, options: argparse.Namespace) -> dict[str, Any]:
     """Tune, judge and print for one objective."""
-    shop = Workshop(options.seconds, objective, options.worlds[0])
+    shop = Workshop(options.seconds, objective, options.worlds[0], options.surface)
     names = [name.split(".")[1] for name in shop.free.names]
     true = np.array([np.log(TRUE.get(name, 1.0)) for name in shop.free.names])
     print(f"\nobjective {objective}: found / true [95 % interval]; surface (m) and scale as they are")
