@@ -1,7 +1,8 @@
 """Find known noise again without ground truth, and judge it on recordings that it was not tuned on.
 
     python experiments/tune_noise.py [--worlds street city] [--seeds 0 1 2] [--held-out 100 101 102]
-        [--seconds 20] [--factors 10 0.1] [--objectives noise] [--iterations 40] [--surface] [--simplex] [--json FILE]
+        [--seconds 20] [--factors 10 0.1] [--objectives noise] [--iterations 40] [--surface] [--simplex]
+        [--json FILE]
 
 Simulates recordings of a MEMS sensor, starts with all noise FACTOR times its true value and tunes on each
 recording by itself. Tables: what was found over what is true; what the tuned filter says of itself on the
