@@ -46,13 +46,17 @@ class Trajectory:
         inside = stamp_ns[(stamp_ns >= self.stamp_ns[0]) & (stamp_ns <= self.stamp_ns[-1])]
         if len(self) == 1 or inside.size == 0:
             return Trajectory(inside, np.repeat(self.poses[:1], inside.size, axis=0))
-        origin = self.stamp_ns[0]
-        knots = (self.stamp_ns - origin) * 1e-9
+        # those around the stamps alone: a query for a moment must not cost the whole trajectory
+        first = min(np.searchsorted(self.stamp_ns, inside.min(), "right") - 1, len(self) - 2)
+        last = max(np.searchsorted(self.stamp_ns, inside.max(), "left"), first + 1)
+        near = slice(first, last + 1)
+        origin = self.stamp_ns[first]
+        knots = (self.stamp_ns[near] - origin) * 1e-9
         query = (inside - origin) * 1e-9
         poses = np.tile(np.eye(4), (inside.size, 1, 1))
-        poses[:, :3, :3] = Slerp(knots, Rotation.from_matrix(self.poses[:, :3, :3]))(query).as_matrix()
+        poses[:, :3, :3] = Slerp(knots, Rotation.from_matrix(self.poses[near, :3, :3]))(query).as_matrix()
         for axis in range(3):
-            poses[:, axis, 3] = np.interp(query, knots, self.positions[:, axis])
+            poses[:, axis, 3] = np.interp(query, knots, self.poses[near, axis, 3])
         return Trajectory(inside, poses)
 
 

@@ -43,7 +43,8 @@ def thinned(
     near, far = params.lidar.min_range.astype(jnp.float32), params.lidar.max_range.astype(jnp.float32)
     mask = scan.mask & (squared_range > near**2) & (squared_range < far**2)
     chosen = select_per_voxel(scan.points, mask, params.map.point_spacing, insertion_points)
-    points = scan.points[chosen.index]
+    # what is not finite in an empty row would spoil the derivatives of sums that leave it out
+    points = jnp.where(chosen.mask[:, None], scan.points[chosen.index], 0.0)
     matched = select_per_voxel(points, chosen.mask, registration_spacing, registration_points)
     return ThinnedScan(
         points, scan.time[chosen.index], chosen.mask, matched, chosen.dropped + matched.dropped

@@ -7,7 +7,8 @@ import jaxlie
 from jaxtyping import Array, Float
 
 from lio_jax.core.params import Params
-from lio_jax.registration.scan_to_map import Frame, Matches, point_noise
+from lio_jax.registration.placed_sums import placed_sums
+from lio_jax.registration.scan_to_map import Frame, Matches, PointNoise, noise_at, point_noise, squares
 
 
 class PointEvidence(eqx.Module):
@@ -37,15 +38,26 @@ def point_evidence(
         frame: of the matches.
         params: traced.
     """
+    kind, dtype = points.dtype, T_world_lidar.wxyz_xyz.dtype
     noise = point_noise(matches, points, T_world_lidar, frame, params)
-    kernel = params.registration.kernel.astype(points.dtype)
     # as in iteratively reweighted least squares, the weights are no part of the derivative
-    weight = jax.lax.stop_gradient(noise.weight(kernel))
-    sums = jnp.stack(
-        [
-            jnp.sum(weight * noise.precision * noise.distance**2),
-            jnp.sum(weight * jnp.log(noise.variance)),
-            params.registration.information_scale.astype(points.dtype),
-        ]
-    ).astype(T_world_lidar.wxyz_xyz.dtype)
-    return PointEvidence(*sums)
+    weight = jax.lax.stop_gradient(noise.weight(params.registration.kernel.astype(kind)))
+    sums = placed_sums(
+        jax.lax.stop_gradient(jnp.sum(_weighted(noise, weight), -1)),
+        _rows,
+        points,
+        *frame.placing(T_world_lidar, kind),
+        jnp.stack(squares(params, kind)),
+        (matches, weight),
+    ).astype(dtype)
+    squared_error, log_det = sums
+    return PointEvidence(squared_error, log_det, params.registration.information_scale.astype(dtype))
+
+
+def _rows(arm: Array, shift: Array, scales: Array, constants: tuple[Matches, Array]) -> Array:
+    matches, weight = constants
+    return _weighted(noise_at(matches, arm.T, shift, *scales), weight)
+
+
+def _weighted(noise: PointNoise, weight: Array) -> Array:
+    return weight * jnp.stack([noise.precision * noise.distance**2, jnp.log(noise.variance)])

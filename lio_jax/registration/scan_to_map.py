@@ -10,6 +10,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.implicit import Problem, Solution, implicit
+from lio_jax.core.materialise import materialised
 from lio_jax.core.params import Params
 from lio_jax.core.rotation import rotation_matrix
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, query_nearest
@@ -24,6 +25,7 @@ from lio_jax.registration.gauss_newton import (
     registration_at,
     unmet,
 )
+from lio_jax.registration.placed_sums import placed_sums
 
 
 class Frame(eqx.Module):
@@ -38,8 +40,16 @@ class Frame(eqx.Module):
         self, points: Float[Array, "k 3"], T_world_lidar: jaxlie.SE3
     ) -> tuple[Float[Array, "k 3"], Float[Array, "k 3"]]:
         """Return points of the lidar frame in world axes, from the sensor and from the origin, m."""
-        arm = points @ rotation_matrix(T_world_lidar.rotation()).astype(points.dtype).T
-        return arm, arm + (T_world_lidar.translation() - self.origin).astype(points.dtype)
+        R, shift = self.placing(T_world_lidar, points.dtype)
+        arm = points @ R.T
+        return arm, arm + shift
+
+    def placing(
+        self, T_world_lidar: jaxlie.SE3, dtype: jnp.dtype
+    ) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+        """Return the turn into world axes, and the way from the sensor to the origin, m."""
+        R = rotation_matrix(T_world_lidar.rotation())
+        return R.astype(dtype), (T_world_lidar.translation() - self.origin).astype(dtype)
 
 
 class Matches(eqx.Module):
@@ -116,17 +126,25 @@ def point_noise(
     between. The point's own variance s^2 is that of the range and of the surface, plus that of the beam's
     direction times the squared offset along the surface, which grows with range and grazing incidence.
     """
-    kind = points.dtype
-    arm, placed = frame.place(jnp.where(matches.used[:, None], points, 0.0), T_world_lidar)
+    R, shift = frame.placing(T_world_lidar, points.dtype)
+    arm = jnp.where(matches.used[:, None], points, 0.0) @ R.T
+    return noise_at(matches, arm, shift, *squares(params, points.dtype))
+
+
+def squares(params: Params, dtype: jnp.dtype) -> tuple[Array, Array]:
+    """Return the variances of a point along its plane's normal (m^2) and of a beam's direction (rad^2)."""
+    lidar = params.lidar
+    facing = lidar.range_sigma**2 + lidar.surface_sigma**2
+    return facing.astype(dtype), (lidar.angle_sigma**2).astype(dtype)
+
+
+def noise_at(matches: Matches, arm: Array, shift: Array, facing: Array, turning: Array) -> PointNoise:
     along = jnp.sum(arm * matches.normal, -1)
     range_squared = jnp.sum(arm**2, -1)
     across = jnp.maximum(range_squared - along**2, 0.0)
-    lidar = params.lidar
-    facing = (lidar.range_sigma**2 + lidar.surface_sigma**2).astype(kind)
-    own = facing + lidar.angle_sigma.astype(kind) ** 2 * across
-    variances = own[:, None] + matches.variances
+    variances = (facing + turning * across)[:, None] + matches.variances
     known = 1 / variances
-    distance = jnp.sum(matches.normal * (placed - matches.mean), -1)
+    distance = jnp.sum(matches.normal * (arm + shift - matches.mean), -1)
     distance = jnp.where(matches.used, distance, 0.0)
     precision = jnp.where(matches.used, known[:, 0] - known[:, 1], 0.0)
     return PointNoise(
@@ -170,15 +188,42 @@ def linearise(
     matched = matches.used.astype(kind)
     scalars = [matched, weight, weight * noise.scaled_squared, matched * jnp.sum(arm**2, -1)]
     weighted = jnp.concatenate([(weight * noise.precision)[:, None] * row, jnp.stack(scalars, -1)], -1)
-    sums = (row.T @ weighted).astype(dtype)
-    count, weight_sum, squared_error, arm_squared = sums[7, 8:]
+    sums = jax.lax.stop_gradient(row.T @ weighted)
+    total = placed_sums(
+        jnp.concatenate([sums[:6, :6].ravel(), sums[:6, 6], sums[7, 9:]]),
+        _rows,
+        points,
+        *frame.placing(T_world_lidar, kind),
+        jnp.stack([*squares(params, kind), kernel.astype(kind)]),
+        matches,
+    ).astype(dtype)
+    hessian, count = total[:36].reshape(6, 6), sums[7, 8]
+    weight_sum, squared_error, arm_squared = total[42:]
     return NormalEquations(
-        hessian=(sums[:6, :6] + sums[:6, :6].T) / 2,
-        gradient=sums[:6, 6],
+        hessian=(hessian + hessian.T) / 2,
+        gradient=total[36:42],
         matches=count.astype(jnp.int32),
         weight=weight_sum,
         squared_error=squared_error,
-        arm_squared=arm_squared / jnp.maximum(count, 1.0),
+        arm_squared=arm_squared / jnp.maximum(count, 1.0).astype(dtype),
+    )
+
+
+def _rows(arm: Array, shift: Array, scales: Array, matches: Matches) -> Array:
+    """Return what each point adds to the sums of :func:`linearise`."""
+    facing, turning, kernel = scales
+    noise = noise_at(matches, arm.T, shift, facing, turning)
+    weight = noise.weight(kernel)
+    believed = weight * noise.precision
+    jacobian = jnp.concatenate([jnp.cross(noise.arm, matches.normal), matches.normal], -1).T
+    jacobian, scaled = materialised((jacobian, believed * jacobian))
+    arm_squared = jnp.where(matches.used, jnp.sum(noise.arm**2, -1), 0.0)
+    return jnp.concatenate(
+        [
+            (scaled[:, None] * jacobian).reshape(36, -1),
+            noise.distance * scaled,
+            jnp.stack([weight, weight * noise.scaled_squared, arm_squared]),
+        ]
     )
 
 
