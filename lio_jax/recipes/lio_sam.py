@@ -182,9 +182,12 @@ def step(
             max_iterations=config.lio_sam.smoother_iterations,
             tolerance=params.smoother.tolerance,
         )
-        failed = runs_away(window.latest(), params)
-        fresh = opened(config, params, _at_rest(state.nav, T_world_imu))
-        failed = failed & ~first
+        failed = runs_away(window.latest(), params) & ~first
+        # neither the samples that led astray nor a match that began at their prediction
+        coasted = state.nav.T_world_imu.translation() + interval * odometry.velocity
+        coasted = jaxlie.SE3.from_rotation_and_translation(guess.rotation(), coasted)
+        T_world_imu = jaxlie.SE3(jnp.where(failed, coasted.wxyz_xyz, T_world_imu.wxyz_xyz))
+        fresh = opened(config, params, _at_rest(state.nav, T_world_imu), params.smoother.degenerate_sigma)
         window = jax.tree.map(
             lambda old, new, anew: jnp.where(first, old, jnp.where(failed, anew, new)),
             state.window,

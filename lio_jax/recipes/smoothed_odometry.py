@@ -22,13 +22,22 @@ from lio_jax.estimation.sliding_window import Added, Window, open_window, still_
 from lio_jax.registration.gauss_newton import Registration
 
 
-def opened(config: Config, params: Params, nav: NavState) -> Window:
-    """Return the window with one state, around which ``params.initial`` says how far the truth may lie."""
+def opened(
+    config: Config, params: Params, nav: NavState, position_sigma: Float[Array, ""] | None = None
+) -> Window:
+    """Return the window with one state, around which ``params.initial`` says how far the truth may lie.
+
+    Args:
+        config: ``config.lio_sam.window``.
+        params: ``params.initial`` and ``params.smoother``.
+        nav: the state.
+        position_sigma: m; None: that of ``params.smoother``, as the first position defines the world.
+    """
     initial, smoother = params.initial, params.smoother
     identity = jnp.eye(3, dtype=nav.velocity.dtype)
     sigmas = (
         (ROTATION, initial.rotation_sigma),
-        (POSITION, smoother.position_sigma),
+        (POSITION, smoother.position_sigma if position_sigma is None else position_sigma),
         (VELOCITY, initial.velocity_sigma),
         (GYRO_BIAS, initial.gyro_bias_sigma),
         (ACCEL_BIAS, initial.accel_bias_sigma),

@@ -1,5 +1,6 @@
 """Covariances tell the errors' true size, and a window follows gtsam's fixed-lag smoother."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -31,6 +32,31 @@ def test_the_average_error_is_that_of_the_covariances():
             dof = RUNS * (3 if part == "velocity" else 6)
             low, high = chi2.ppf([0.025, 0.975], dof)
             assert low < sum(values) < high, (name, part, sum(values) / dof)
+
+
+def test_a_window_that_forgets_stays_consistent():
+    """The latest of the states, when most of the run has been marginalised."""
+    capacity, runs = 4, 100
+
+    def squares(recording):
+        chain = recording.chain
+        window = open_window(capacity, chain.prior, GRAVITY, Added(rows(chain.imu, 0), rows(chain.lidar, 0)))
+
+        def step(window, k):
+            added = Added(rows(chain.imu, k - 1), rows(chain.lidar, k))
+            return append_and_update(window, added, max_iterations=10, tolerance=jnp.array(1e-6))
+
+        window, results = jax.lax.scan(step, window, jnp.arange(1, ROWS))
+        covariance = rows(results, -1).covariances()[capacity - 1]
+        error = window.latest().local(rows(recording.truth, ROWS - 1))
+        parts = (slice(0, 6), slice(6, 9), slice(9, 15))
+        return jnp.stack([error[p] @ jnp.linalg.solve(covariance[p, p], error[p]) for p in parts])
+
+    program = quick_jit(squares)
+    sums = sum(np.asarray(program(simulate(seed, ROWS))) for seed in range(3000, 3000 + runs))
+    for name, dof, total in zip(("pose", "velocity", "biases"), (6, 3, 6), sums, strict=True):
+        low, high = chi2.ppf([0.025, 0.975], runs * dof)
+        assert low < total < high, (name, total / (runs * dof))
 
 
 def batch_smoother(gtsam, lag: float):

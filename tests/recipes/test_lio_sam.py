@@ -222,6 +222,8 @@ def test_a_runaway_bias_starts_the_smoother_anew():
     restarted = [bool(output.restarted) for output in outputs]
     assert restarted.index(True) >= MOVING
     assert not outputs[restarted.index(True)].added.any()
+    # the wild samples foretell 1.5 m, and a match that begins there ends elsewhere
+    assert ate(poses) < 0.03
     for output in outputs:
         assert np.isfinite(np.asarray(output.covariance)).all()
         assert np.isfinite(float(output.log_evidence))
