@@ -184,8 +184,8 @@ def step(
         )
         failed = runs_away(window.latest(), params) & ~first
         # neither the samples that led astray nor a match that began at their prediction
-        coasted = state.nav.T_world_imu.translation() + interval * odometry.velocity
-        coasted = jaxlie.SE3.from_rotation_and_translation(guess.rotation(), coasted)
+        place = state.nav.T_world_imu.translation() + interval * odometry.velocity
+        coasted = jaxlie.SE3.from_rotation_and_translation(guess.rotation(), place)
         T_world_imu = jaxlie.SE3(jnp.where(failed, coasted.wxyz_xyz, T_world_imu.wxyz_xyz))
         fresh = opened(config, params, _at_rest(state.nav, T_world_imu), params.smoother.degenerate_sigma)
         window = jax.tree.map(
