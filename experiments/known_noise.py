@@ -14,7 +14,9 @@ DENSITIES = {
     "gyro_bias_walk": 3.564e-5,
     "accel_bias_walk": 6.4357e-5,
 }
-TRUE = {**{f"imu.{name}": value for name, value in DENSITIES.items()}, "lidar.range_sigma": 0.02}
+RANGE_SIGMA = 0.02
+TRUE = {**{f"imu.{name}": value for name, value in DENSITIES.items()}, "lidar.range_sigma": RANGE_SIGMA}
+SURFACE = "lidar.surface_sigma"
 BLOCKS = {"pose": slice(0, 6), "velocity": slice(6, 9), "biases": slice(9, 15)}
 SETTLED = 20
 """Scans until the start has been forgotten."""
@@ -71,7 +73,10 @@ class Judged:
 class Workshop:
     """Recordings and compiled programs, shared by all tunings of one objective."""
 
-    def __init__(self, recipe: str, seconds: float, objective: str, world: str) -> None:
+    def __init__(
+        self, recipe: str, seconds: float, objective: str, world: str, surface: bool = False
+    ) -> None:
+        from lio_jax.core.settings import with_overrides
         from lio_jax.tuning.loss import Loss
         from lio_jax.tuning.named_objectives import objective_named
         from lio_jax.tuning.parameters import free_parameters
@@ -81,7 +86,8 @@ class Workshop:
         self._recipe, tuning = recipe, TUNINGS[recipe]
         self._recordings: dict[tuple[str, int], Any] = {}
         self.settings = self._settings(self._sequence(world, 0))
-        self.free = free_parameters(self.settings.params(), tuning.free)
+        start = with_overrides(self.settings, [f"params.{SURFACE}={RANGE_SIGMA}"] if surface else [])
+        self.free = free_parameters(start.params(), (*tuning.free, SURFACE) if surface else tuning.free)
         named = objective_named(objective)
         arguments = (self.settings.recipe, self.settings.config, self.free, named.objective)
         self.loss, self.values = Loss(*arguments), StreamingValues(*arguments)
@@ -97,11 +103,11 @@ class Workshop:
         return self._recordings[world, seed]
 
     def start(self, factor: float) -> np.ndarray:
-        """Return all noise at ``factor`` times its true value."""
+        """Return all noise at ``factor`` times its true value, the surfaces' at that of the ranges."""
         x = np.asarray(self.free.first()).copy()
         for place, name in enumerate(self.free.names):
-            if name in TRUE:
-                x[place] = np.log(TRUE[name] * factor)
+            if name in TRUE or name == SURFACE:
+                x[place] = np.log(TRUE.get(name, RANGE_SIGMA) * factor)
         return x
 
     def tuned(self, world: str, seed: int, factor: float, iterations: int) -> Found:

@@ -1,8 +1,8 @@
 """Find known noise again without ground truth, and judge it on recordings that it was not tuned on.
 
     python experiments/tune_noise.py [--recipe default | lio_sam] [--worlds street city] [--seeds 0 1 2]
-        [--held-out 100 101 102] [--seconds 20] [--factors 10 0.1] [--objectives noise] [--iterations 28]
-        [--simplex] [--json FILE]
+        [--held-out 100 101 102] [--seconds 20] [--factors 10 0.1] [--objectives noise] [--iterations 40]
+        [--surface] [--simplex] [--json FILE]
 
 Simulates recordings of a MEMS sensor, starts with all noise FACTOR times its true value and tunes on each
 recording by itself: the recipe default by its innovations, lio_sam by its smoother's marginal likelihood.
@@ -19,7 +19,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from known_noise import BLOCKS, TRUE, TUNINGS, Found, Workshop
+from known_noise import BLOCKS, SURFACE, TRUE, TUNINGS, Found, Workshop
 
 from lio_jax.commands.runtime import prepare_jax
 
@@ -34,7 +34,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--factors", nargs="+", type=float, default=[10.0, 0.1])
     parser.add_argument("--objectives", nargs="+")
-    parser.add_argument("--iterations", type=int, default=28)
+    parser.add_argument("--iterations", type=int, default=40)
+    parser.add_argument("--surface", action="store_true", help=f"tune {SURFACE} too (default)")
     parser.add_argument("--simplex", action="store_true")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
@@ -48,7 +49,7 @@ def main() -> None:
 
 def tables(objective: str, options: argparse.Namespace) -> dict[str, Any]:
     """Tune, judge and print for one objective."""
-    shop = Workshop(options.recipe, options.seconds, objective, options.worlds[0])
+    shop = Workshop(options.recipe, options.seconds, objective, options.worlds[0], options.surface)
     names = [name.split(".")[1] for name in shop.free.names]
     true = np.array([np.log(TRUE.get(name, 1.0)) for name in shop.free.names])
     print(f"\nobjective {objective}: found / true [95 % interval]; what has no true value as it is")

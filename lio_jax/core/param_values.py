@@ -23,7 +23,13 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "extrinsic_translation_sigma": 0.0,
         "time_offset_sigma": 0.0,
     },
-    "lidar": {"range_sigma": 0.045, "angle_sigma": 0.0, "min_range": 2.0, "max_range": 100.0},
+    "lidar": {
+        "range_sigma": 0.045,
+        "surface_sigma": 0.0,
+        "angle_sigma": 0.0,
+        "min_range": 2.0,
+        "max_range": 100.0,
+    },
     "map": {
         "voxel_size": 1.2,
         "corner_voxel_size": 0.4,
@@ -138,6 +144,7 @@ DIFFERENTIABLE = (
     *(f"imu.{name}" for name in DEFAULTS["imu"]),
     *(f"initial.{name}" for name in DEFAULTS["initial"]),
     "lidar.range_sigma",
+    "lidar.surface_sigma",
     "lidar.angle_sigma",
     "registration.kernel",
     "registration.information_scale",
@@ -152,6 +159,7 @@ _ANY_SIGN = {"extrinsics.translation", "extrinsics.time_offset", "gps.lever_arm"
 _MAY_BE_ZERO = {
     *(f"initial.{name}" for name in DEFAULTS["initial"]),
     "lidar.min_range",
+    "lidar.surface_sigma",
     "lidar.angle_sigma",
     "registration.reassociation_distance",
     "knn.distance_weight",

@@ -59,7 +59,9 @@ class LidarParams(eqx.Module):
     """The sensor's measurement model."""
 
     range_sigma: Scalar
-    """Standard deviation of a point against the map's surface, m."""
+    """Standard deviation of a range, m; of a point from its surface in all, unless the next is above zero."""
+    surface_sigma: Scalar
+    """Of surfaces from the planes of the default recipe's map, beyond the scatter of their points, m."""
     angle_sigma: Scalar
     """Standard deviation of a beam's direction, rad: it counts at long range and grazing incidence."""
     min_range: Scalar

@@ -88,17 +88,16 @@ class PointNoise(eqx.Module):
     """From the sensor, in world axes, m."""
     distance: Float[Array, " k"]
     """Along the plane's normal, m; zero where there is no match."""
-    facing: Float[Array, " k"]
-    """Cosine of incidence."""
     variance: Float[Array, " k"]
     """Of the distance, m^2; one where there is no match."""
     precision: Float[Array, " k"]
     """What the distance is believed with, 1/m^2; zero where there is no match."""
+    scaled_squared: Float[Array, " k"]
+    """Of the distance, scaled by its noise: the square itself on a flat voxel, m^2."""
 
-    def weight(self, kernel: Float[Array, ""], range_sigma: Float[Array, ""]) -> Float[Array, " k"]:
+    def weight(self, kernel: Float[Array, ""]) -> Float[Array, " k"]:
         """Return the Geman-McClure weights of the noise-scaled distances, zero where there is no match."""
-        squared = range_sigma**2 * self.precision * self.distance**2
-        return jnp.where(self.precision > 0, (kernel**2 / (kernel**2 + squared)) ** 2, 0.0)
+        return jnp.where(self.precision > 0, (kernel**2 / (kernel**2 + self.scaled_squared)) ** 2, 0.0)
 
 
 def point_noise(
@@ -114,25 +113,28 @@ def point_noise(
     k = 1 / (s^2 + l0) - 1 / (s^2 + l1), where l0 <= l1 are the two smaller variances of the voxel: what is
     known about the normal in excess of the next direction. A flat voxel acts as a plane; a shapeless one does
     not act at all, and neither does a single scan line, whose normal is undefined, with no class boundaries
-    between. The point's own variance s^2 is that of the range, plus that of the beam's direction times the
-    squared offset along the surface, which grows with range and grazing incidence.
+    between. The point's own variance s^2 is that of the range and of the surface, plus that of the beam's
+    direction times the squared offset along the surface, which grows with range and grazing incidence.
     """
     kind = points.dtype
     arm, placed = frame.place(jnp.where(matches.used[:, None], points, 0.0), T_world_lidar)
     along = jnp.sum(arm * matches.normal, -1)
     range_squared = jnp.sum(arm**2, -1)
     across = jnp.maximum(range_squared - along**2, 0.0)
-    own = params.lidar.range_sigma.astype(kind) ** 2 + params.lidar.angle_sigma.astype(kind) ** 2 * across
+    lidar = params.lidar
+    facing = (lidar.range_sigma**2 + lidar.surface_sigma**2).astype(kind)
+    own = facing + lidar.angle_sigma.astype(kind) ** 2 * across
     variances = own[:, None] + matches.variances
     known = 1 / variances
     distance = jnp.sum(matches.normal * (placed - matches.mean), -1)
-    far = jnp.where(matches.used, range_squared, 1.0)
+    distance = jnp.where(matches.used, distance, 0.0)
+    precision = jnp.where(matches.used, known[:, 0] - known[:, 1], 0.0)
     return PointNoise(
         arm=arm,
-        distance=jnp.where(matches.used, distance, 0.0),
-        facing=jnp.abs(along) / jnp.sqrt(far),
+        distance=distance,
         variance=jnp.where(matches.used, variances[:, 0], 1.0),
-        precision=jnp.where(matches.used, known[:, 0] - known[:, 1], 0.0),
+        precision=precision,
+        scaled_squared=facing * precision * distance**2,
     )
 
 
@@ -147,13 +149,11 @@ def linearise(
     """Return the robustly weighted normal equations of associated points at a pose.
 
     Robust weight: Geman-McClure on s sqrt(k) n'e, the noise-scaled distance in m of a point at offset e from
-    its plane's mean, with precision k.
+    its plane's mean, with precision k and s^2 of range and surface.
     """
     dtype, kind = T_world_lidar.wxyz_xyz.dtype, points.dtype
     noise = point_noise(matches, points, T_world_lidar, frame, params)
-    range_sigma = params.lidar.range_sigma.astype(kind)
-    weight = noise.weight(kernel.astype(kind), range_sigma)
-    distance_squared = range_sigma**2 * noise.precision * noise.distance**2
+    weight = noise.weight(kernel.astype(kind))
     arm, distance = noise.arm, noise.distance
 
     # one matrix product gives every sum over the points: the normal equations from the rows, the rest from
@@ -168,7 +168,7 @@ def linearise(
         -1,
     )
     matched = matches.used.astype(kind)
-    scalars = [matched, weight, weight * distance_squared, matched * jnp.sum(arm**2, -1)]
+    scalars = [matched, weight, weight * noise.scaled_squared, matched * jnp.sum(arm**2, -1)]
     weighted = jnp.concatenate([(weight * noise.precision)[:, None] * row, jnp.stack(scalars, -1)], -1)
     sums = (row.T @ weighted).astype(dtype)
     count, weight_sum, squared_error, arm_squared = sums[7, 8:]

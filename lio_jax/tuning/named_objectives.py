@@ -9,9 +9,9 @@ from lio_jax.tuning.objectives import (
     MeanOverScans,
     WeightedSum,
     map_consistency,
-    plane_thickness,
     point_innovation,
     pose_innovation,
+    range_noise,
 )
 from lio_jax.tuning.trajectory_objectives import AbsoluteError, RelativeError
 
@@ -32,13 +32,13 @@ _SINGLE = {
     "pose": Named(MeanOverScans(pose_innovation, _OPENING), False, True),
     "point": Named(MeanOverScans(point_innovation, _OPENING), False, True),
     "marginal": Named(MarginalLikelihood(_OPENING), False, True),
-    "planes": Named(MeanOverScans(plane_thickness, _OPENING), False, True),
+    "ranges": Named(MeanOverScans(range_noise, _OPENING), False, True),
     "map": Named(MeanOverScans(map_consistency), False, False),
     "ate": Named(AbsoluteError(), True, False),
     "rpe": Named(RelativeError(), True, False),
     "rpe-rotation": Named(RelativeError(rotation=True), True, False),
 }
-_SHORT = {"noise": "pose+planes"}
+_SHORT = {"noise": "pose+ranges"}
 """What is called by a name of its own."""
 
 

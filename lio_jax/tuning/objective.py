@@ -1,12 +1,14 @@
 """What an objective is: sums that grow from scan to scan, and a value of them."""
 
+from dataclasses import replace
 from typing import Any, Protocol
 
 import equinox as eqx
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.types import NavState
+from lio_jax.core.params import Params
+from lio_jax.core.types import NavState, Scan
 from lio_jax.recipes.output import Evidence
 
 
@@ -19,7 +21,7 @@ class TruePose(eqx.Module):
 
 
 class Observed(eqx.Module):
-    """What one scan's step leaves to see."""
+    """One scan, the parameters, and what its step leaves to see."""
 
     nav: NavState
     """At the scan's end."""
@@ -34,6 +36,10 @@ class Observed(eqx.Module):
     """How well the scan was foretold; None from recipes that carry no covariance."""
     log_evidence: Float[Array, ""] | None
     """Of all measurements so far; None from recipes without a smoother."""
+    scan: Scan | None = None
+    """As it was fed to the step."""
+    params: Params | None = None
+    """The step's."""
 
     @staticmethod
     def of(state: Any, output: Any) -> "Observed":
@@ -48,6 +54,13 @@ class Observed(eqx.Module):
             evidence=output.evidence,
             log_evidence=output.log_evidence,
         )
+
+    def beside(self, scan: Scan, params: Params) -> "Observed":
+        """Return the same with what went into the step.
+
+        Not by :meth:`of`: a program that hands its arguments through has them copied.
+        """
+        return replace(self, scan=scan, params=params)
 
 
 class Objective(Protocol):

@@ -9,9 +9,15 @@ from jaxtyping import Array, Float
 
 from lio_jax.core.errors import UsageError
 from lio_jax.core.types import state_dtype
+from lio_jax.lidar.range_scatter import range_scatter
 from lio_jax.recipes.output import Evidence
 from lio_jax.registration.point_evidence import PointEvidence
 from lio_jax.tuning.objective import Objective, Observed, TruePose
+
+_CAUCHY = 0.6120031809624806
+"""Where 2 z^2 / (z^2 + c^2) is one on average over a normal z."""
+_SHARPNESS = 1.669886
+"""Curvature over variance of the scores of that density, by the logarithm of its scale."""
 
 
 class MeanOverScans(eqx.Module):
@@ -111,9 +117,23 @@ def point_innovation(seen: Observed, truth: TruePose) -> Float[Array, ""]:
     return 0.5 * (scale * (points.squared_error + points.log_det) + g @ W @ g + log_det)
 
 
-def plane_thickness(seen: Observed, truth: TruePose) -> Float[Array, ""]:
-    """Return how badly ``lidar.range_sigma`` explains the scatter of the map's points about their planes."""
-    return _points(seen).thickness
+def range_noise(seen: Observed, truth: TruePose) -> Float[Array, ""]:
+    """Return how badly ``lidar.range_sigma`` explains the scatter of neighbouring returns.
+
+    Edges between neighbours are many and far off, so the scatter's scale is asked for by a Cauchy density
+    (Huber & Ronchetti, "Robust statistics", 2009, section 5): normal noise gives it a scale of ``_CAUCHY``
+    sigmas, and with ``_SHARPNESS`` its scores vary as much as it curves, as those of a likelihood do.
+    """
+    scan, params = seen.scan, seen.params
+    if scan is None or params is None:
+        raise UsageError(
+            "the objective ranges wants the scan and the parameters beside what a step left to see."
+        )
+    scatter = range_scatter(scan, params)
+    ranges = (params.lidar.range_sigma * scatter.spread) ** 2
+    variance = _CAUCHY**2 * (ranges + (params.lidar.angle_sigma * scatter.slope) ** 2)
+    loss = jnp.log(variance) / 2 + jnp.log1p(scatter.deviation**2 / variance)
+    return _SHARPNESS * jnp.sum(jnp.where(scatter.valid, loss, 0.0))
 
 
 def map_consistency(seen: Observed, truth: TruePose) -> Float[Array, ""]:
@@ -136,5 +156,5 @@ def _evidence(seen: Observed) -> Evidence:
 def _points(seen: Observed) -> PointEvidence:
     points = _evidence(seen).points
     if points is None:
-        raise UsageError("the recipe's map keeps no planes' thicknesses; use the objective pose.")
+        raise UsageError("the recipe tells nothing of single points; use the objective pose.")
     return points

@@ -40,7 +40,7 @@ def scoring(evaluate: Evaluate, x: Vector, bounds: Bounds, iterations: int) -> N
 
     Only for likelihoods. Far from the solution the scores' spread overstates the curvature by orders of
     magnitude; the last two gradients tell by how much (Barzilai & Borwein 1988). Ends where the gradient is
-    within a tenth of its own standard deviation.
+    within a tenth of its own standard deviation, or of one nat.
     """
     scale, last = 1.0, None
     for _ in range(iterations):
@@ -57,14 +57,19 @@ def scoring(evaluate: Evaluate, x: Vector, bounds: Bounds, iterations: int) -> N
         step = np.asarray(bounds.clip(x + step) - x, np.float64)
         free = np.abs(step) > 0
         shift = gradient[free]
-        if not free.any() or shift @ np.linalg.solve(information[np.ix_(free, free)], shift) < 0.01:
+        spread = (information + _LEAST_CURVATURE * np.eye(len(x)))[np.ix_(free, free)]
+        if not free.any() or shift @ np.linalg.solve(spread, shift) < 0.01:
             return
         x, last = x + step, (step, gradient)
 
 
 def fisher_information(result: Evaluated) -> NDArray[np.float64]:
-    """Return the sum of the scores' outer products, regular where a parameter has no effect."""
-    information = result.scores.T @ result.scores
+    """Return the scores' spread about their mean, regular where a parameter has no effect.
+
+    About their mean: what all scans ask for alike, the gradient, tells nothing of the curvature.
+    """
+    scores = result.scores - np.mean(result.scores, axis=0)
+    information = scores.T @ scores
     return information + np.diag(np.where(np.diag(information) > 0, 1e-9 * np.diag(information), 1.0))
 
 

@@ -70,6 +70,9 @@ class CheckpointedGradient:
             state, output = module.step(config, free(x), state, scan, imu)
             return state, Observed.of(state, output)
 
+        def add(x: Array, sums: Any, seen: Observed, scan: Scan, truth: TruePose) -> Any:
+            return objective.add(sums, seen.beside(scan, free(x)), truth)
+
         def backward(
             kind: str, x: Array, state: Any, sums: Any, scan: Any, imu: Any, truth: Any, cotangent: Any
         ) -> tuple[Array, Any, Any]:
@@ -79,7 +82,7 @@ class CheckpointedGradient:
                 old = None if state is None else eqx.combine(smooth, fixed)
                 new, seen = forward(kind, x, old, scan, imu)
                 if seen is not None and truth is not None:
-                    sums = objective.add(sums, seen, truth)
+                    sums = add(x, sums, seen, scan, truth)
                 return parted(new)[0], sums
 
             _, pull = jax.vjp(smooth_part, x, smooth, sums)
@@ -87,7 +90,7 @@ class CheckpointedGradient:
 
         self.forward = {kind: PerShape(jax.jit(partial(forward, kind))) for kind in _KINDS}
         self.backward = {kind: PerShape(jax.jit(partial(backward, kind))) for kind in _KINDS}
-        self.add = PerShape(jax.jit(objective.add))
+        self.add = PerShape(jax.jit(add))
         self.value = PerShape(jax.jit(jax.value_and_grad(objective.value)))
 
     def __call__(
@@ -102,7 +105,7 @@ class CheckpointedGradient:
         """
         tape = _Tape(self, jnp.asarray(x), max(every or math.isqrt(len(recording)), _SHORTEST))
         for fed, state, seen in stepped(tape, recording.feed()):
-            tape.count(state, seen, recording.truth_at(fed.end_ns))
+            tape.count(state, seen, fed.scan, recording.truth_at(fed.end_ns))
         return tape.unwound()
 
 
@@ -134,10 +137,10 @@ class _Tape:
             self._kept[number] = old and old.state
         return _Numbered(number, state), seen
 
-    def count(self, state: _Numbered, seen: Observed, truth: TruePose) -> None:
+    def count(self, state: _Numbered, seen: Observed, scan: Scan, truth: TruePose) -> None:
         """Add the last step to the objective."""
         self._operations[state.number].truth = truth
-        self._sums = self._programs.add(self._sums, seen, truth)
+        self._sums = self._programs.add(self._x, self._sums, seen, scan, truth)
 
     def unwound(self) -> tuple[float, NDArray[np.float64]]:
         """Return the objective and its gradient, from the tape's end to its start."""

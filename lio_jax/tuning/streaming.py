@@ -68,7 +68,8 @@ class StreamingGradient:
         shares, unconverged = [], []
         for fed, _, (seen, seen_dot) in stepped(self._steps.at(x), recording.feed()):
             before = sums_dot
-            sums, sums_dot = self._add(sums, sums_dot, seen, seen_dot, recording.truth_at(fed.end_ns))
+            truth = recording.truth_at(fed.end_ns)
+            sums, sums_dot = self._add(x, sums, sums_dot, seen, seen_dot, fed.scan, truth)
             shares.append(jax.tree.map(lambda new, old: np.asarray(new) - np.asarray(old), sums_dot, before))
             if int(seen.status) in (ITERATION_LIMIT, NOT_FINITE):
                 unconverged.append(fed.index)
@@ -77,14 +78,16 @@ class StreamingGradient:
         return Gradient(float(value), scores.sum(0), scores, tuple(unconverged))
 
     def _add_with_tangents(
-        self, sums: Any, sums_dot: Any, seen: Observed, seen_dot: Any, truth: TruePose
+        self, x: Array, sums: Any, sums_dot: Any, seen: Observed, seen_dot: Any, scan: Scan, truth: TruePose
     ) -> tuple[Any, Any]:
         smooth, fixed = eqx.partition(seen, eqx.is_inexact_array)
 
-        def add(sums: Any, smooth: Any) -> tuple[Any, None]:
-            return self.objective.add(sums, eqx.combine(smooth, fixed), truth), None
+        def add(x: Array, sums: Any, smooth: Any) -> tuple[Any, None]:
+            seen = eqx.combine(smooth, fixed).beside(scan, self.free(x))
+            return self.objective.add(sums, seen, truth), None
 
-        sums, _, sums_dot = pushed(add, (sums, smooth), (sums_dot, seen_dot))
+        tangents = jnp.eye(len(x), dtype=x.dtype), sums_dot, seen_dot
+        sums, _, sums_dot = pushed(add, (x, sums, smooth), tangents)
         return sums, sums_dot
 
     def _value_with_tangents(self, sums: Any, dots: Any) -> tuple[Array, Array]:

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.config import Config
+from lio_jax.core.types import Scan
 from lio_jax.recipes import recipe_named
 from lio_jax.run.compilation import PerShape
 from lio_jax.run.track import stepped
-from lio_jax.tuning.objective import Objective, Observed
+from lio_jax.tuning.objective import Objective, Observed, TruePose
 from lio_jax.tuning.parameters import Free
 from lio_jax.tuning.recording import Recording
 
@@ -29,10 +30,13 @@ class StreamingValues:
             state, output = module.step(config, free(x), state, scan, imu)
             return state, Observed.of(state, output)
 
+        def add(x: Any, sums: Any, seen: Observed, scan: Scan, truth: TruePose) -> Any:
+            return objective.add(sums, seen.beside(scan, free(x)), truth)
+
         self.init = PerShape(jax.jit(jax.vmap(lambda x, imu: module.init(config, free(x), imu), (0, None))))
         self.exchanged = module.moving_as
         self.step = PerShape(jax.jit(jax.vmap(one, (0, 0, None, None)), donate_argnums=1))
-        self._add = PerShape(jax.jit(jax.vmap(objective.add, (0, 0, None))))
+        self._add = PerShape(jax.jit(jax.vmap(add, (0, 0, 0, None, None))))
         self._value = PerShape(jax.jit(jax.vmap(objective.value)))
 
     def __call__(self, xs: NDArray[np.float64], recording: Recording) -> NDArray[np.float64]:
@@ -42,7 +46,7 @@ class StreamingValues:
             lambda leaf: jnp.broadcast_to(leaf, (len(x), *leaf.shape)), self._objective.start()
         )
         for fed, _, seen in stepped(_Batch(self, x), recording.feed()):
-            sums = self._add(sums, seen, recording.truth_at(fed.end_ns))
+            sums = self._add(x, sums, seen, fed.scan, recording.truth_at(fed.end_ns))
         return np.asarray(self._value(sums))
 
 

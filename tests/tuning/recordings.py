@@ -60,7 +60,14 @@ def settings(recipe: str, inertial: bool, *more: str) -> Settings:
     positive = [f"params.initial.{name}={value or 0.01}" for name, value in section.items()]
     # samples and scans of a simulation share their instants, where the sampling has a kink
     offset = "params.extrinsics.time_offset=0.0013"
-    overrides = [*SMALL, *positive, offset, "params.lidar.angle_sigma=0.001", *more]
+    overrides = [
+        *SMALL,
+        *positive,
+        offset,
+        "params.lidar.angle_sigma=0.001",
+        "params.lidar.surface_sigma=0.02",
+        *more,
+    ]
     if not inertial:
         overrides.append("config.imu.use=false")
     return settings_for(drive(), with_overrides(recipe_settings(recipe), overrides))[0]

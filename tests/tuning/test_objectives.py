@@ -124,10 +124,15 @@ def test_an_unknown_objective_lists_those_there_are(text):
         objective_named(text)
 
 
-@pytest.mark.parametrize("name", ["pose", "point", "planes"])
+@pytest.mark.parametrize("name", ["pose", "point"])
 def test_innovations_want_a_filter(name):
     with pytest.raises(UsageError, match="ate, rpe or map"):
         loss(MeanOverScans(objective_named(name).objective.loss), poses(0), poses(1))
+
+
+def test_the_range_noise_wants_the_scan():
+    with pytest.raises(UsageError, match="wants the scan"):
+        loss(objective_named("ranges").objective, poses(0), poses(1))
 
 
 def test_the_marginal_likelihood_is_what_the_scans_after_the_opening_add():

@@ -1,0 +1,72 @@
+"""How far a scan's returns lie off the planes through their neighbours: the range noise, before any map."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from lio_jax.core.params import Params
+from lio_jax.core.types import Scan
+
+_APART = (1e-5, 0.025)
+"""Angles between neighbours of a ring, rad: closer ones are returns of one pulse, others have lost neighbours
+between them."""
+_STEEPEST = 0.866
+"""Sine of incidence up to which neighbours are compared: at grazing incidence they tell of the beams."""
+
+
+class RangeScatter(eqx.Module):
+    """Returns against the plane through their two neighbours along the ring, each return used once."""
+
+    deviation: Float[Array, " t"]
+    """Range beyond that plane, m."""
+    spread: Float[Array, " t"]
+    """Standard deviation of ``deviation`` by range noise of 1 m on each of the three."""
+    slope: Float[Array, " t"]
+    """The same by noise of 1 rad of the beams' directions, m."""
+    valid: Bool[Array, " t"]
+
+
+def range_scatter(scan: Scan, params: Params) -> RangeScatter:
+    """Return the deviations of every third return of each ring.
+
+    On a plane the inverse range is linear in the beam's direction, so that the ranges of two neighbours
+    foretell the one between them. Edges between the three make outliers.
+
+    Args:
+        scan: padded sweep, each ring's returns in the order they were taken.
+        params: ``lidar.min_range`` and ``lidar.max_range`` bound the returns that count.
+    """
+    lidar = params.lidar
+    distance = jnp.linalg.norm(scan.points, axis=-1)
+    usable = scan.mask & (distance > lidar.min_range) & (distance < lidar.max_range)
+    ring = jnp.where(usable, scan.ring, jnp.iinfo(scan.ring.dtype).max)
+    order = jnp.argsort(ring, stable=True)
+    order = order[: 3 * (order.shape[0] // 3)].reshape(-1, 3)
+    (first, middle, last), ranges = jnp.moveaxis(scan.points[order], 1, 0), distance[order]
+    near, here, far = (jnp.where(usable[order[:, k]], ranges[:, k], 1.0) for k in range(3))
+    before = _angle(first / near[:, None], middle / here[:, None])
+    after = _angle(middle / here[:, None], last / far[:, None])
+    both = jnp.sin(before + after)
+    own = jnp.where(both > 0, both, 1.0)
+    # the middle direction is a combination of the outer ones
+    share_near, share_far = jnp.sin(after) / own, jnp.sin(before) / own
+    inverse = share_near / near + share_far / far
+    foretold = 1 / jnp.where(inverse > 0, inverse, 1.0)
+    by_near, by_far = share_near * (foretold / near) ** 2, share_far * (foretold / far) ** 2
+    spread = jnp.sqrt(1 + by_near**2 + by_far**2)
+    along = far - near
+    sine = jnp.abs(along) / jnp.maximum(jnp.linalg.norm(last - first, axis=-1), 1e-6)
+    together = jnp.all(usable[order], -1) & (scan.ring[order[:, 0]] == scan.ring[order[:, 2]])
+    apart = [(angle > _APART[0]) & (angle < _APART[1]) for angle in (before, after)]
+    valid = together & apart[0] & apart[1] & (sine < _STEEPEST)
+    return RangeScatter(
+        deviation=jnp.where(valid, here - foretold, 0.0),
+        spread=jnp.where(valid, spread, 1.0),
+        slope=jnp.where(valid, spread * along / jnp.where(valid, before + after, 1.0), 0.0),
+        valid=valid,
+    )
+
+
+def _angle(one: Float[Array, "t 3"], other: Float[Array, "t 3"]) -> Float[Array, " t"]:
+    """Return the angles between unit vectors, rad: by the chord, exact in float32 where they are small."""
+    return 2 * jnp.arcsin(jnp.minimum(jnp.linalg.norm(one - other, axis=-1) / 2, 1.0))
