@@ -148,7 +148,9 @@ DIFFERENTIABLE = (
     "lidar.angle_sigma",
     "registration.kernel",
     "registration.information_scale",
+    "knn.distance_weight",
     *(f"smoother.{name}" for name in ("rotation_sigma", "translation_sigma", "degenerate_sigma")),
+    *(f"smoother.{name}" for name in ("kernel", "position_sigma", "tilt_weight")),
     *(f"extrinsics.{name}" for name in DEFAULTS["extrinsics"]),
 )
 """Leaves with a derivative. The others choose: which points, which voxels, when to stop, what to report."""

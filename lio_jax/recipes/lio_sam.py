@@ -22,7 +22,7 @@ from lio_jax.core.config import Config
 from lio_jax.core.error_state import DOF as NAV_DOF
 from lio_jax.core.errors import UsageError
 from lio_jax.core.params import Params
-from lio_jax.core.types import ImuBatch, NavState, Scan
+from lio_jax.core.types import ImuBatch, NavState, Scan, state_dtype
 from lio_jax.estimation.chain import information_of, linearise
 from lio_jax.estimation.evidence import log_evidence
 from lio_jax.estimation.motion_state import DOF
@@ -71,13 +71,18 @@ def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
         imu: samples of about a second up to the first scan's end.
 
     Raises:
-        UsageError: there are no inertial data.
+        UsageError: there are no inertial data, or states are in single precision.
     """
     own = config.lio_sam
     if imu is None:
         raise UsageError(
             "the recipe lio_sam needs inertial samples, and there are none (or config.imu.use is false); "
             "take loam, or default."
+        )
+    if state_dtype() != jnp.float64:
+        raise UsageError(
+            "the recipe lio_sam needs double precision, its smoother's information is singular without: call "
+            "jax.config.update('jax_enable_x64', True) before anything else."
         )
     check_sizes(config)
     nav = levelled_start(params, imu).nav
@@ -170,16 +175,19 @@ def step(
         intervals = sample_intervals(imu, state.nav.time_offset, end - interval, end)
         latest = state.window.latest()
         link = preintegrate_parallel(intervals, latest.gyro_bias, latest.accel_bias, params.imu)
-        measured = match_as_measurement(config, params, T_world_imu, match, matched)
+        measured = match_as_measurement(config, params, T_world_imu, match, _arm_squared(points), matched)
         window, smoothed = append_and_update(
             state.window,
             Added(link, measured),
             max_iterations=config.lio_sam.smoother_iterations,
             tolerance=params.smoother.tolerance,
         )
-        failed = runs_away(window.latest(), params)
-        fresh = opened(config, params, _at_rest(state.nav, T_world_imu))
-        failed = failed & ~first
+        failed = runs_away(window.latest(), params) & ~first
+        # neither the samples that led astray nor a match that began at their prediction
+        place = state.nav.T_world_imu.translation() + interval * odometry.velocity
+        coasted = jaxlie.SE3.from_rotation_and_translation(guess.rotation(), place)
+        T_world_imu = jaxlie.SE3(jnp.where(failed, coasted.wxyz_xyz, T_world_imu.wxyz_xyz))
+        fresh = opened(config, params, _at_rest(state.nav, T_world_imu), params.smoother.degenerate_sigma)
         window = jax.tree.map(
             lambda old, new, anew: jnp.where(first, old, jnp.where(failed, anew, new)),
             state.window,
@@ -199,7 +207,9 @@ def step(
     with jax.named_scope("keyframe"):
         # the map is a constant of the derivative
         T_world_lidar, still = jax.lax.stop_gradient((lidar_pose(nav), points))
-        sound = (matched & ~failed) | (first & seen)
+        away = time - jnp.maximum(state.matched_at, 0.0) > params.limits.outage
+        # where the map does not reach, a new piece of it begins at the prediction
+        sound = ((matched | (lost & enough & away)) & ~failed) | (first & seen)
         keyframe = sound & is_due(state.map.keyframes, T_world_lidar, params.submap)
         submap, frames, placed, added = with_scan(
             state.map, keyframe, still, T_world_lidar, jax.lax.stop_gradient(time), params
@@ -269,6 +279,14 @@ def _compensated(
         surface=deskew_along(path, T_imu_lidar, surface.points, surface.time),
         surface_mask=surface.mask,
     )
+
+
+def _arm_squared(points: FeaturePoints) -> Float[Array, ""]:
+    """Return the mean squared distance of a scan's features from the sensor, m^2."""
+    both = jnp.concatenate([points.corner, points.surface])
+    mask = jnp.concatenate([points.corner_mask, points.surface_mask])
+    total = jnp.sum(jnp.where(mask[:, None], both, 0.0) ** 2)
+    return (total / jnp.maximum(jnp.sum(mask), 1)).astype(state_dtype())
 
 
 def _covariance(smoothed: Smoothed, window: Window) -> Float[Array, "24 24"]:

@@ -6,7 +6,7 @@ every 100 states from the marginal covariance, the window marginalises its oldes
 
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from lio_jax.core.blocks import from_blocks
 from lio_jax.core.config import Config
@@ -14,20 +14,30 @@ from lio_jax.core.error_state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, 
 from lio_jax.core.params import Params
 from lio_jax.core.types import NavState
 from lio_jax.estimation.marginal_prior import gaussian_prior
-from lio_jax.estimation.motion_state import DOF, MotionState
+from lio_jax.estimation.motion_state import DOF, POSE_DOF, MotionState
 from lio_jax.estimation.pose_factors import PoseMeasurement, fixed_information
 from lio_jax.estimation.pose_logarithm import adjoint
+from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.estimation.sliding_window import Added, Window, open_window, still_link
 from lio_jax.registration.gauss_newton import Registration
 
 
-def opened(config: Config, params: Params, nav: NavState) -> Window:
-    """Return the window with one state, around which ``params.initial`` says how far the truth may lie."""
+def opened(
+    config: Config, params: Params, nav: NavState, position_sigma: Float[Array, ""] | None = None
+) -> Window:
+    """Return the window with one state, around which ``params.initial`` says how far the truth may lie.
+
+    Args:
+        config: ``config.lio_sam.window``.
+        params: ``params.initial`` and ``params.smoother``.
+        nav: the state.
+        position_sigma: m; None: that of ``params.smoother``, as the first position defines the world.
+    """
     initial, smoother = params.initial, params.smoother
     identity = jnp.eye(3, dtype=nav.velocity.dtype)
     sigmas = (
         (ROTATION, initial.rotation_sigma),
-        (POSITION, smoother.position_sigma),
+        (POSITION, smoother.position_sigma if position_sigma is None else position_sigma),
         (VELOCITY, initial.velocity_sigma),
         (GYRO_BIAS, initial.gyro_bias_sigma),
         (ACCEL_BIAS, initial.accel_bias_sigma),
@@ -47,7 +57,12 @@ def opened(config: Config, params: Params, nav: NavState) -> Window:
 
 
 def match_as_measurement(
-    config: Config, params: Params, T_world_imu: jaxlie.SE3, match: Registration, there: Bool[Array, ""]
+    config: Config,
+    params: Params,
+    T_world_imu: jaxlie.SE3,
+    match: Registration,
+    arm_squared: Float[Array, ""],
+    there: Bool[Array, ""],
 ) -> PoseMeasurement:
     """Return what a scan match says of the IMU's pose.
 
@@ -56,11 +71,17 @@ def match_as_measurement(
         params: ``params.smoother``.
         T_world_imu: the pose.
         match: it comes from.
+        arm_squared: mean squared distance of the scan's points from the sensor, m^2.
         there: whether there was one.
     """
     if config.lio_sam.lidar_noise == "information":
         by_imu = adjoint(params.extrinsics.T_imu_lidar().inverse())
-        information = params.registration.information_scale * (by_imu.T @ match.information @ by_imu)
+        # along a degenerate direction the pose is the prediction, of which the samples tell already
+        ratio = jnp.where(jnp.any(match.degenerate), params.registration.degeneracy_ratio, 0.0)
+        observed, _, _ = keep_observed(
+            match.information, jnp.zeros(POSE_DOF, arm_squared.dtype), arm_squared, ratio
+        )
+        information = params.registration.information_scale * (by_imu.T @ observed @ by_imu)
     else:
         smoother = params.smoother
         degenerate = jnp.any(match.degenerate)

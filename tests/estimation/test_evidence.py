@@ -49,7 +49,7 @@ def test_a_window_that_forgot_knows_as_much_as_the_whole_chain(linear, along):
     expected = jax.tree.map(lambda rows: rows[-CAPACITY:], whole.states)
     covariances = np.asarray(whole.covariances()[-CAPACITY:])
     sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    np.testing.assert_allclose(expected.local(result.states) / sigma, 0, atol=1e-7)
+    np.testing.assert_allclose(expected.local(result.states) / sigma, 0, atol=1e-9)
     scale = sigma[:, :, None] * sigma[:, None]
     np.testing.assert_allclose(result.covariances() / scale, covariances / scale, atol=1e-9)
 

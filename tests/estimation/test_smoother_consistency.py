@@ -1,5 +1,6 @@
 """Covariances tell the errors' true size, and a window follows gtsam's fixed-lag smoother."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -33,8 +34,48 @@ def test_the_average_error_is_that_of_the_covariances():
             assert low < sum(values) < high, (name, part, sum(values) / dof)
 
 
-def test_a_window_follows_gtsams_fixed_lag_smoother():
-    """The end state within 1 % of sigma: both marginalise the same states, each in its own coordinates."""
+def test_a_window_that_forgets_stays_consistent():
+    """The latest of the states, when most of the run has been marginalised."""
+    capacity, runs = 4, 100
+
+    def squares(recording):
+        chain = recording.chain
+        window = open_window(capacity, chain.prior, GRAVITY, Added(rows(chain.imu, 0), rows(chain.lidar, 0)))
+
+        def step(window, k):
+            added = Added(rows(chain.imu, k - 1), rows(chain.lidar, k))
+            return append_and_update(window, added, max_iterations=10, tolerance=jnp.array(1e-6))
+
+        window, results = jax.lax.scan(step, window, jnp.arange(1, ROWS))
+        covariance = rows(results, -1).covariances()[capacity - 1]
+        error = window.latest().local(rows(recording.truth, ROWS - 1))
+        parts = (slice(0, 6), slice(6, 9), slice(9, 15))
+        return jnp.stack([error[p] @ jnp.linalg.solve(covariance[p, p], error[p]) for p in parts])
+
+    program = quick_jit(squares)
+    sums = sum(np.asarray(program(simulate(seed, ROWS))) for seed in range(3000, 3000 + runs))
+    for name, dof, total in zip(("pose", "velocity", "biases"), (6, 3, 6), sums, strict=True):
+        low, high = chi2.ppf([0.025, 0.975], runs * dof)
+        assert low < total < high, (name, total / (runs * dof))
+
+
+def batch_smoother(gtsam, lag: float):
+    settings = gtsam.LevenbergMarquardtParams()
+    settings.setRelativeErrorTol(1e-12)
+    return gtsam.BatchFixedLagSmoother(lag, settings)
+
+
+def incremental_smoother(gtsam, lag: float):
+    """ISAM2, relinearised at each update."""
+    settings = gtsam.ISAM2Params()
+    settings.relinearizeSkip = 1
+    settings.setRelinearizeThreshold(1e-9)
+    return gtsam.IncrementalFixedLagSmoother(lag, settings)
+
+
+@pytest.mark.parametrize("made", [batch_smoother, incremental_smoother])
+def test_a_window_follows_gtsams_fixed_lag_smoothers(made):
+    """The end state within 1 % of sigma: all marginalise the same states, each in its own coordinates."""
     gtsam = pytest.importorskip("gtsam")
     from gtsam.symbol_shorthand import B, V, X
     from gtsam_chain import GtsamChain
@@ -44,9 +85,7 @@ def test_a_window_follows_gtsams_fixed_lag_smoother():
     advance = quick_jit(lambda w, a: append_and_update(w, a, max_iterations=20, tolerance=jnp.array(1e-9)))
     window = open_window(capacity, chain.prior, GRAVITY, Added(rows(chain.imu, 0), rows(chain.lidar, 0)))
     theirs = GtsamChain(recording)
-    settings = gtsam.LevenbergMarquardtParams()
-    settings.setRelativeErrorTol(1e-12)
-    fixed_lag = gtsam.BatchFixedLagSmoother(capacity - 0.5, settings)
+    fixed_lag = made(gtsam, capacity - 0.5)
     for k in range(ROWS):
         values, graph, stamps = gtsam.Values(), gtsam.NonlinearFactorGraph(), {}
         theirs.insert(values, k)
@@ -55,6 +94,9 @@ def test_a_window_follows_gtsams_fixed_lag_smoother():
         for key in (X(k), V(k), B(k)):
             stamps[key] = float(k)
         fixed_lag.update(graph, values, stamps)
+        for _ in range(3):
+            # one of ISAM2's updates is one step
+            fixed_lag.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {})
         if k == 0:
             continue
         window, result = advance(window, Added(rows(chain.imu, k - 1), rows(chain.lidar, k)))

@@ -11,6 +11,7 @@ from lio_jax.core.settings import recipe_settings
 from lio_jax.recipes import RECIPES
 from lio_jax.run.track import CompiledStep, stepped
 from lio_jax.tuning.objective import Observed
+from lio_jax.tuning.objectives import MarginalLikelihood
 from lio_jax.tuning.parameters import free_parameters
 from lio_jax.tuning.reverse import CheckpointedGradient
 from lio_jax.tuning.streaming import StreamingGradient
@@ -120,6 +121,24 @@ def test_gradients_of_every_leaf_agree_with_central_differences(recipe, inertial
         high, low = (total(HeldMap(chosen, free(end), nominal), recording) for end in ends)
         difference = (high - low) / (2 * step)
         assert result.gradient[component] == pytest.approx(difference, rel=1e-4, abs=noise / step), name
+
+
+def test_the_marginal_likelihood_has_a_derivative_by_every_leaf():
+    """Finite, and none where the smoother and its scan matches have no part in it."""
+    chosen = settings("lio_sam", True, *TIGHT)
+    recording = DoubleRecording(drive(), chosen, 0, 8)
+    free = free_parameters(chosen.params(), DIFFERENTIABLE)
+    program = StreamingGradient("lio_sam", chosen.config, free, MarginalLikelihood(3))
+    result = program(np.asarray(free.first()), recording)
+    assert np.isfinite(result.value)
+    assert np.isfinite(result.scores).all()
+    by_name = dict(zip(free.names, result.gradient, strict=True))
+    # loose matches of half a second tell little of the samples' noise
+    assert by_name["imu.gyro_noise"] != 0
+    assert by_name["imu.accel_noise"] != 0
+    assert abs(by_name["smoother.rotation_sigma"]) > 1e-3
+    assert abs(by_name["smoother.translation_sigma"]) > 1e-3
+    assert by_name["lidar.angle_sigma"] == 0
 
 
 FEW = ("imu.gyro_noise", "imu.accel_noise", "lidar.range_sigma", "extrinsics.*")

@@ -1,0 +1,209 @@
+"""Simulated recordings of known noise, what each recipe can tell of it, and how a tuned one is judged."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import minimize
+
+# the MEMS sensor of LIO-SAM's recordings, by the densities of its own configuration
+DENSITIES = {
+    "gyro_noise": 1.5636e-3,
+    "accel_noise": 3.99395e-3,
+    "gyro_bias_walk": 3.564e-5,
+    "accel_bias_walk": 6.4357e-5,
+}
+RANGE_SIGMA = 0.02
+TRUE = {**{f"imu.{name}": value for name, value in DENSITIES.items()}, "lidar.range_sigma": RANGE_SIGMA}
+SURFACE = "lidar.surface_sigma"
+BLOCKS = {"pose": slice(0, 6), "velocity": slice(6, 9), "biases": slice(9, 15)}
+SETTLED = 20
+"""Scans until the start has been forgotten."""
+_MOMENT_NS = 10_000_000
+SIZE = {"beams": 32, "columns": 1024}
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What is tuned of a recipe, and by which objective."""
+
+    free: tuple[str, ...]
+    objective: str
+    overrides: tuple[str, ...] = ()
+    """Settings that the recordings ask for."""
+
+
+TUNINGS = {
+    "default": Tuning((*TRUE, "registration.information_scale"), "noise"),
+    "lio_sam": Tuning(
+        ("imu.*_noise", "imu.*_walk", "smoother.rotation_sigma", "smoother.translation_sigma"),
+        "marginal",
+        # the sensor's first biases are 20 times what LIO-SAM expects; the world's gravity is not its place's
+        (
+            "params.initial.gyro_bias_sigma=0.01",
+            "params.initial.accel_bias_sigma=0.1",
+            "params.imu.gravity=9.80665",
+        ),
+    ),
+}
+"""By recipe. Of a scan match's sigmas nobody knows the true ones: they are tuned along."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """A tuning's end."""
+
+    x: np.ndarray
+    sigma: np.ndarray
+    losses: list[float]
+    scans: int
+
+
+@dataclass(frozen=True)
+class Judged:
+    """How a filter did on one recording."""
+
+    ate_mm: float
+    nees: dict[str, float]
+    nis: float
+    """Not a number for a recipe without innovations."""
+
+
+class Workshop:
+    """Recordings and compiled programs, shared by all tunings of one objective."""
+
+    def __init__(
+        self, recipe: str, seconds: float, objective: str, world: str, surface: bool = False
+    ) -> None:
+        from lio_jax.core.settings import with_overrides
+        from lio_jax.tuning.loss import Loss
+        from lio_jax.tuning.named_objectives import objective_named
+        from lio_jax.tuning.parameters import free_parameters
+        from lio_jax.tuning.values import StreamingValues
+
+        self.seconds = seconds
+        self._recipe, tuning = recipe, TUNINGS[recipe]
+        self._recordings: dict[tuple[str, int], Any] = {}
+        self.settings = self._settings(self._sequence(world, 0))
+        start = with_overrides(self.settings, [f"params.{SURFACE}={RANGE_SIGMA}"] if surface else [])
+        self.free = free_parameters(start.params(), (*tuning.free, SURFACE) if surface else tuning.free)
+        named = objective_named(objective)
+        arguments = (self.settings.recipe, self.settings.config, self.free, named.objective)
+        self.loss, self.values = Loss(*arguments), StreamingValues(*arguments)
+        self._step: Any = None
+
+    def recording(self, world: str, seed: int) -> Any:
+        """Return a simulated recording, cast once."""
+        from lio_jax.tuning.recording import Recording
+
+        if (world, seed) not in self._recordings:
+            sequence = self._sequence(world, seed)
+            self._recordings[world, seed] = Recording(sequence, self._settings(sequence)), sequence
+        return self._recordings[world, seed]
+
+    def start(self, factor: float) -> np.ndarray:
+        """Return all noise at ``factor`` times its true value, the surfaces' at that of the ranges."""
+        x = np.asarray(self.free.first()).copy()
+        for place, name in enumerate(self.free.names):
+            if name in TRUE or name == SURFACE:
+                x[place] = np.log(TRUE.get(name, RANGE_SIGMA) * factor)
+        return x
+
+    def tuned(self, world: str, seed: int, factor: float, iterations: int) -> Found:
+        """Tune on one recording."""
+        from lio_jax.tuning.optimise import Bounds, fisher_information, scoring
+
+        recording, _ = self.recording(world, seed)
+        evaluated: list[tuple[np.ndarray, Any]] = []
+
+        def evaluate(x: np.ndarray) -> Any:
+            evaluated.append((x, self.loss(x, [recording])))
+            return evaluated[-1][1]
+
+        x = self.start(factor)
+        scoring(evaluate, x, Bounds(x - np.log(1e3), x + np.log(1e3)), iterations)
+        x, last = evaluated[-1]
+        sigma = np.sqrt(np.diag(np.linalg.inv(fisher_information(last))))
+        losses = [result.value for _, result in evaluated]
+        return Found(x, sigma, losses, sum(result.scans for _, result in evaluated))
+
+    def judged(self, x: np.ndarray | None, world: str, seed: int) -> Judged:
+        """Run with the parameters of ``x``, or with the shipped ones, and compare with the truth."""
+        from lio_jax.core.error_state import local
+        from lio_jax.evaluation.alignment import align, position_errors
+        from lio_jax.evaluation.consistency import nees
+        from lio_jax.run.track import CompiledStep, stepped
+
+        recording, sequence = self.recording(world, seed)
+        arrays, motion = sequence.truth_arrays(), sequence.truth()
+        self._step = step = self._step or CompiledStep(self.settings)
+        step.params = self.settings.params() if x is None else self.free(jnp.asarray(x))
+        poses, truth, errors, covariances, nis = [], [], [], [], []
+        anchor = None
+        for fed, state, output in stepped(step, recording.feed()):
+            nav, true = state.nav, recording.truth_at(fed.end_ns).T_world_imu
+            if anchor is None:
+                # the first pose defines the map's frame
+                anchor = nav.T_world_imu @ true.inverse()
+            here = anchor @ true
+            around = motion.at(fed.end_ns + np.array([-_MOMENT_NS, _MOMENT_NS])).positions
+            if len(around) < 2:
+                break
+            velocity = (around[1] - around[0]) / (2e-9 * _MOMENT_NS)
+            known = {
+                "T_world_imu": here,
+                "velocity": anchor.rotation() @ jnp.asarray(velocity),
+                "gyro_bias": jnp.asarray(_at(arrays, "gyro_bias", fed.end_ns)),
+                "accel_bias": jnp.asarray(_at(arrays, "accel_bias", fed.end_ns)),
+            }
+            errors.append(np.asarray(local(nav, replace(nav, **known)))[:15])
+            covariances.append(np.asarray(output.covariance)[:15, :15])
+            poses.append(np.asarray(nav.T_world_imu.as_matrix()))
+            truth.append(np.asarray(true.as_matrix()))
+            nis.append((float(output.nis), int(output.nis_dof)))
+        error, covariance = np.array(errors)[SETTLED:], np.array(covariances)[SETTLED:]
+        estimate, reference = np.array(poses), np.array(truth)
+        off = position_errors(align(estimate, reference), estimate, reference)
+        nis_sum, dof_sum = np.array(nis)[SETTLED:].sum(0)
+        return Judged(
+            ate_mm=1e3 * float(np.sqrt(np.mean(off**2))),
+            nees={
+                name: float(np.mean(nees(error[:, part], covariance[:, part, part])))
+                / (part.stop - part.start)
+                for name, part in BLOCKS.items()
+            },
+            nis=float(nis_sum / dof_sum) if dof_sum else np.nan,
+        )
+
+    def simplex(self, world: str, seed: int, factor: float, scans: int) -> list[tuple[int, float]]:
+        """Return the best loss by scans processed of Nelder & Mead's method on the same budget."""
+        recording, _ = self.recording(world, seed)
+        course: list[tuple[int, float]] = []
+
+        def value(x: np.ndarray) -> float:
+            loss = float(self.values(x[None], recording)[0])
+            best = min(loss, course[-1][1]) if course else loss
+            course.append(((len(course) + 1) * len(recording), best))
+            return loss
+
+        runs = max(scans // len(recording), 2)
+        minimize(value, self.start(factor), method="Nelder-Mead", options={"maxfev": runs, "xatol": 1e-3})
+        return course
+
+    def _sequence(self, world: str, seed: int) -> Any:
+        from lio_jax import ImuModel, SimulatedSequence
+
+        return SimulatedSequence(world, "generic32", self.seconds, seed, imu=ImuModel(**DENSITIES), **SIZE)
+
+    def _settings(self, sequence: Any) -> Any:
+        from lio_jax.core.settings import recipe_settings, with_overrides
+        from lio_jax.run.run import settings_for
+
+        chosen = with_overrides(recipe_settings(self._recipe), list(TUNINGS[self._recipe].overrides))
+        return settings_for(sequence, chosen)[0]
+
+
+def _at(arrays: dict[str, Any], name: str, stamp_ns: int) -> np.ndarray:
+    place = int(np.argmin(np.abs(arrays["imu_stamp_ns"] - stamp_ns)))
+    return np.asarray(arrays[name][place])
