@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from lio_jax.loops.block_cholesky import NotPositiveDefiniteError, factorise, solve
+from lio_jax.loops.block_cholesky import factorise, solve
 from lio_jax.loops.graph import Poses, Status
+from lio_jax.loops.multifrontal import NotPositiveDefiniteError
 from lio_jax.loops.normal_equations import Padded, Point, point_after
 from lio_jax.loops.structure import Structure
 

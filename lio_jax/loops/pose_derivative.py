@@ -10,11 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from lio_jax.core.implicit import Problem, implicit
 from lio_jax.core.implicit import Solution as Root
-from lio_jax.loops.block_cholesky import factorise, one_thread
+from lio_jax.loops.block_cholesky import factorise
 from lio_jax.loops.block_cholesky import solve as solve_factored
 from lio_jax.loops.descent import Limits
 from lio_jax.loops.factors import edge_costs, residuals
 from lio_jax.loops.graph import PoseGraph, Poses, moved, picked
+from lio_jax.loops.multifrontal import one_thread
 from lio_jax.loops.pose_graph import solve
 from lio_jax.loops.structure import Structure, structure_from, structure_of
 

@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.loops.block_cholesky import NotPositiveDefiniteError, factorise, one_thread
+from lio_jax.loops.block_cholesky import factorise
 from lio_jax.loops.block_cholesky import solve as solve_factored
 from lio_jax.loops.chordal import chordal_poses
 from lio_jax.loops.descent import Equations, Limits, descend
 from lio_jax.loops.graduated import Robust, graduate
 from lio_jax.loops.graph import PoseGraph, Poses, Solution
+from lio_jax.loops.multifrontal import NotPositiveDefiniteError, one_thread
 from lio_jax.loops.normal_equations import Padded, Point, padded, padded_poses, padded_weights, point_after
 from lio_jax.loops.structure import Structure, structure_of
 
