@@ -17,14 +17,16 @@ _Numbers = NDArray[np.int64]
 
 WORTH_A_LEVEL = 48
 """Fewer nodes are eliminated as fast with the rest of the graph."""
+_AT_ONCE = 1024
+"""More nodes make two levels of one: fresh memory for all of them costs more than their arithmetic."""
 
 
 @dataclass(frozen=True)
 class Level:
     """Nodes that are eliminated at once: none is coupled to another one.
 
-    Blocks count from those on the diagonal on, then come those of the pairs, then those that each level
-    makes. Beside the diagonal a block's rows are the greater node's.
+    Blocks count from those on the diagonal on, then come those of the pairs, whose rows are the greater
+    node's. The first coupling's place then takes the block that couples the neighbours.
     """
 
     nodes: _Numbers
@@ -32,9 +34,7 @@ class Level:
     neighbours: _Numbers
     """(k, 2) the smaller first; the number of all nodes where there is none."""
     couplings: _Numbers
-    """(k, 2) blocks of a node with its neighbours; -1 where there is none."""
-    made: slice
-    """The k blocks that couple the neighbours afterwards."""
+    """(k, 2) blocks of a node with its neighbours; -1, the last one, of zeros, where there is none."""
     touched: _Numbers
     """(t,) the neighbours, each once."""
     sums: sparse.csr_array
@@ -47,14 +47,12 @@ class Reduction:
     """What is eliminated of a graph's chains, and the graph that is left."""
 
     levels: tuple[Level, ...]
-    blocks: int
-    """Those of the graph and of all levels."""
     kept: _Numbers
     """(c,) nodes that are left, ascending."""
     pairs: _Numbers
     """(p, 2) of places in ``kept``, the greater first, none twice."""
     sums: sparse.csr_array
-    """(c + p, blocks) makes the blocks of the graph that is left from all."""
+    """(c + p, n + m + 1) makes the blocks of the graph that is left from all, the last one of zeros."""
 
 
 def chain_reduction(count: int, pairs: _Numbers, worth_a_level: int = WORTH_A_LEVEL) -> Reduction:
@@ -70,19 +68,18 @@ def chain_reduction(count: int, pairs: _Numbers, worth_a_level: int = WORTH_A_LE
     chains = replace(chains, link=np.where(chains.link < 0, -1, chains.link + count))
     in_chains = np.zeros(len(pairs), bool)
     in_chains[chains.link[chains.link >= 0] - count] = True
-    blocks = count + len(pairs)
     left = np.ones(count, bool)
     while True:
         out = (chains.place % 2 == 1) & ~chains.outside
         at = np.flatnonzero(out)
         if len(at) < worth_a_level:
             break
-        made = slice(blocks, blocks + len(at))
-        levels.append(_level(count, chains, at, made))
+        parts = np.array_split(at, -(-len(at) // _AT_ONCE))
+        of_parts = [_level(count, chains, part) for part in parts]
+        levels += of_parts
         left[chains.nodes[at]] = False
-        blocks = made.stop
         link = chains.link.copy()
-        link[at - 1] = np.arange(made.start, made.stop)
+        link[at - 1] = np.concatenate([level.couplings[:, 0] for level in of_parts])
         chains = Chains(chains.nodes[~out], (chains.place[~out] + 1) // 2, chains.outside[~out], link[~out])
     following = np.append(chains.nodes[1:], count)
     couples = (chains.link >= 0) & (chains.nodes < count) & (following < count)
@@ -98,14 +95,13 @@ def chain_reduction(count: int, pairs: _Numbers, worth_a_level: int = WORTH_A_LE
     size = max(len(kept), 1)
     return Reduction(
         tuple(levels),
-        blocks,
         kept,
         np.stack([key // size, key % size], -1),
-        sparse.csr_array((np.ones(len(row)), (row, column)), (len(kept) + len(key), blocks)),
+        sparse.csr_array((np.ones(len(row)), (row, column)), (len(kept) + len(key), count + len(pairs) + 1)),
     )
 
 
-def _level(count: int, chains: Chains, at: _Numbers, made: slice) -> Level:
+def _level(count: int, chains: Chains, at: _Numbers) -> Level:
     neighbours = np.stack([chains.nodes[at - 1], chains.nodes[at + 1]], -1)
     couplings = np.stack([chains.link[at - 1], chains.link[at]], -1)
     turned = neighbours[:, 0] > neighbours[:, 1]
@@ -115,4 +111,4 @@ def _level(count: int, chains: Chains, at: _Numbers, made: slice) -> Level:
     there = np.flatnonzero(both < count)
     touched, number = np.unique(both[there], return_inverse=True)
     sums = sparse.csr_array((np.ones(len(there)), (number, there)), (len(touched), len(both)))
-    return Level(chains.nodes[at], neighbours, couplings, made, touched, sums)
+    return Level(chains.nodes[at], neighbours, couplings, touched, sums)
