@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from lio_jax.core.materialise import materialised
 from lio_jax.core.rotation import skew
-from lio_jax.loops.graph import POSITION, PRIOR, PoseGraph, Poses, picked, rotation_first
+from lio_jax.loops.graph import POSITION, PRIOR, PoseGraph, Poses, between, picked, rotation_first
 
 _SERIES_BELOW = 0.3
 """rad; below it the closed forms of the coefficients cancel."""
@@ -39,7 +39,7 @@ def residuals(T_world_i: Poses, T_world_j: Poses, graph: PoseGraph) -> Float[Arr
         T_world_j: (e,) of their second ones.
         graph: that the edges belong to.
     """
-    return _residual(_missed(T_world_i.inverse() @ T_world_j, T_world_j, graph), T_world_j, graph)
+    return _residual(_missed(between(T_world_i, T_world_j), T_world_j, graph), T_world_j, graph)
 
 
 def edge_costs(poses: Poses, graph: PoseGraph) -> Float[Array, " e"]:
@@ -56,10 +56,9 @@ def linearise(poses: Poses, graph: PoseGraph) -> Linearised:
     R_j (v + w x l) for d = (w, v).
     """
     T_world_i, T_world_j = materialised((picked(poses, graph.i), picked(poses, graph.j)))
-    T_j_i = materialised(T_world_j.inverse() @ T_world_i)
-    across = rotation_first(T_j_i.adjoint(), axes=2)
+    across = rotation_first(between(T_world_j, T_world_i).adjoint(), axes=2)
     across = materialised(jnp.where(_is_unary(graph)[:, None, None], 0.0, across))
-    r = materialised(_residual(_missed(T_j_i.inverse(), T_world_j, graph), T_world_j, graph))
+    r = materialised(residuals(T_world_i, T_world_j, graph))
     A_j = right_jacobian_inverse(r)
     A_j = jnp.where((graph.kind == POSITION)[:, None, None], _position_slope(T_world_j, graph), A_j)
     weighted_j, weighted_r = materialised(
@@ -106,7 +105,7 @@ def _missed(T_i_j: Poses, T_world_j: Poses, graph: PoseGraph) -> Poses:
     """Return the pose of j as measured to where it is: Z^-1 T_i_j, Z^-1 T_world_j for one vertex alone."""
     alone = _is_unary(graph)[:, None]
     T_i_j = jax.tree.map(lambda single, both: jnp.where(alone, single, both), T_world_j, T_i_j)
-    return graph.measurement.inverse() @ T_i_j
+    return between(graph.measurement, T_i_j)
 
 
 def _residual(missed: Poses, T_world_j: Poses, graph: PoseGraph) -> Float[Array, "e d"]:
