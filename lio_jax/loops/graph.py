@@ -89,7 +89,7 @@ def between(a: Poses, b: Poses) -> Poses:
     In space column by column: each of jaxlie's own products, of quaternions and with points, costs XLA
     as much as all of this.
     """
-    if isinstance(a, jaxlie.SE2):
+    if not isinstance(a, jaxlie.SE3):
         return a.inverse() @ b
     (numbers_a,), (numbers_b,) = jax.tree.leaves(a), jax.tree.leaves(b)
     w, x, y, z, *from_t = jnp.moveaxis(numbers_a, -1, 0)
