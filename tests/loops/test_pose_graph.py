@@ -19,6 +19,7 @@ from tests.loops.graphs import (
     at,
     graph_of,
     gtsam_graph,
+    gtsam_optimum,
     gtsam_values,
     walk,
     with_poses,
