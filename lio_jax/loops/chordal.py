@@ -138,7 +138,7 @@ def _least_squares(
     pairs = _summed(structure.pair_of, H_pair, len(structure.pairs))
     x = start.copy()
     if count:
-        step = solve(factorise(structure.plan_of_coordinates, np.concatenate([diagonal, pairs])), -gradient)
+        step = solve(factorise(structure.plan_of_coordinates, diagonal, pairs), -gradient)
         x[~structure.held] = step
     return x
 

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from lio_jax.loops.block_cholesky import NotPositiveDefiniteError, factorise, solve
+from lio_jax.loops.block_cholesky import factorise, solve
 from lio_jax.loops.graph import Poses, Status
+from lio_jax.loops.multifrontal import NotPositiveDefiniteError
 from lio_jax.loops.normal_equations import Padded, Point, point_after
 from lio_jax.loops.structure import Structure
 
@@ -109,9 +110,9 @@ class Equations:
         first = len(gradient)
         return Equations(
             structure,
-            blocks[: structure.count].astype(np.float64),
-            blocks[first : first + len(structure.pairs)].astype(np.float64),
-            gradient[: structure.count].astype(np.float64),
+            blocks[: structure.count].astype(np.float64, copy=False),
+            blocks[first : first + len(structure.pairs)].astype(np.float64, copy=False),
+            gradient[: structure.count].astype(np.float64, copy=False),
         )
 
     def solved(self, damping: float) -> tuple[NDArray[np.float64], float]:
@@ -120,12 +121,12 @@ class Equations:
         Raises:
             NotPositiveDefiniteError: H is singular, as far as numbers tell.
         """
-        diagonal = self.diagonal.copy()
-        entry = np.arange(diagonal.shape[-1])
-        scale = diagonal[:, entry, entry]
+        scale = np.diagonal(self.diagonal, axis1=1, axis2=2)
         added = damping * np.maximum(scale, 1e-6 * scale.max(initial=0.0))
-        diagonal[:, entry, entry] += added
-        factor = factorise(self.structure.plan, np.concatenate([diagonal, self.pairs]))
+        diagonal = self.diagonal
+        if damping:
+            diagonal = diagonal + added[:, :, None] * np.eye(added.shape[-1])
+        factor = factorise(self.structure.plan, diagonal, self.pairs)
         step = solve(factor, -self.gradient)
         # H dx = -g - D dx with D the damping: the model falls by -g'dx - dx'H dx / 2 = (-g'dx + dx'D dx) / 2
         return step, float(-np.sum(self.gradient * step) + np.sum(added * step**2)) / 2

@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lio_jax.core.materialise import materialised
 from lio_jax.core.rotation import skew
-from lio_jax.loops.graph import POSITION, PRIOR, PoseGraph, Poses, picked, rotation_first
+from lio_jax.loops.graph import POSITION, PRIOR, PoseGraph, Poses, between, picked, rotation_first
 
 _SERIES_BELOW = 0.3
 """rad; below it the closed forms of the coefficients cancel."""
@@ -38,7 +39,7 @@ def residuals(T_world_i: Poses, T_world_j: Poses, graph: PoseGraph) -> Float[Arr
         T_world_j: (e,) of their second ones.
         graph: that the edges belong to.
     """
-    return _residual(_missed(T_world_i, T_world_j, graph), T_world_j, graph)
+    return _residual(_missed(between(T_world_i, T_world_j), T_world_j, graph), T_world_j, graph)
 
 
 def edge_costs(poses: Poses, graph: PoseGraph) -> Float[Array, " e"]:
@@ -51,24 +52,27 @@ def linearise(poses: Poses, graph: PoseGraph) -> Linearised:
     """Return cost, gradient and Gauss-Newton Hessian of each edge, in closed form.
 
     With E = Z^-1 T_i^-1 T_j perturbations move it by E exp(d_j - Ad(T_j^-1 T_i) d_i), and Log(E exp(d)) by
-    J_r^-1 d. A position's lever l moves by R_j (v + w x l) for d = (w, v).
+    J_r^-1 d: what holds for j holds for i after a product with -Ad. A position's lever l moves by
+    R_j (v + w x l) for d = (w, v).
     """
-    T_world_i, T_world_j = picked(poses, graph.i), picked(poses, graph.j)
-    missed = _missed(T_world_i, T_world_j, graph)
-    r = _residual(missed, T_world_j, graph)
+    T_world_i, T_world_j = materialised((picked(poses, graph.i), picked(poses, graph.j)))
+    across = rotation_first(between(T_world_j, T_world_i).adjoint(), axes=2)
+    across = materialised(jnp.where(_is_unary(graph)[:, None, None], 0.0, across))
+    r = materialised(residuals(T_world_i, T_world_j, graph))
     A_j = right_jacobian_inverse(r)
-    across = rotation_first((T_world_j.inverse() @ T_world_i).adjoint(), axes=2)
     A_j = jnp.where((graph.kind == POSITION)[:, None, None], _position_slope(T_world_j, graph), A_j)
-    A_i = jnp.where(_is_unary(graph)[:, None, None], 0.0, -_product(A_j, across))
-    weighted_i, weighted_j = _product(graph.information, A_i), _product(graph.information, A_j)
-    weighted_r = jnp.einsum("eij,ej->ei", graph.information, r)
+    weighted_j, weighted_r = materialised(
+        (_product(graph.information, A_j), jnp.einsum("eij,ej->ei", graph.information, r))
+    )
+    H_jj, g_j = materialised((_product(_turned(A_j), weighted_j), jnp.einsum("eji,ej->ei", A_j, weighted_r)))
+    H_ij = materialised(-_product(_turned(across), H_jj))
     return Linearised(
         cost=jnp.sum(r * weighted_r, -1) / 2,
-        H_ii=_product(_turned(A_i), weighted_i),
-        H_ij=_product(_turned(A_i), weighted_j),
-        H_jj=_product(_turned(A_j), weighted_j),
-        g_i=jnp.einsum("eji,ej->ei", A_i, weighted_r),
-        g_j=jnp.einsum("eji,ej->ei", A_j, weighted_r),
+        H_ii=-_product(H_ij, across),
+        H_ij=H_ij,
+        H_jj=H_jj,
+        g_i=-jnp.einsum("eji,ej->ei", across, g_j),
+        g_j=g_j,
     )
 
 
@@ -90,18 +94,18 @@ def right_jacobian_inverse(tangent: Float[Array, "e d"]) -> Float[Array, "e d d"
     s = squared
     a = jnp.where(near, 1 / 12 - s**2 * (1 / 30240 + s * (1 / 604800 + s / 15966720)), a)
     b = jnp.where(near, -1 / 720 - s * (1 / 15120 + s * (1 / 403200 + s / 11975040)), b)
-    ad = _ad(tangent)
-    ad2 = _product(ad, ad)
+    ad, a, b = materialised((_ad(tangent), a, b))
+    ad2 = materialised(_product(ad, ad))
+    ad4 = materialised(_product(ad2, ad2))
     identity = jnp.eye(tangent.shape[-1], dtype=tangent.dtype)
-    return identity + ad / 2 + a[:, None, None] * ad2 + b[:, None, None] * _product(ad2, ad2)
+    return identity + ad / 2 + a[:, None, None] * ad2 + b[:, None, None] * ad4
 
 
-def _missed(T_world_i: Poses, T_world_j: Poses, graph: PoseGraph) -> Poses:
-    """Return the pose of j as measured to where it is: Z^-1 T_i^-1 T_j, without T_i for one vertex alone."""
-    T_i_j = T_world_i.inverse() @ T_world_j
+def _missed(T_i_j: Poses, T_world_j: Poses, graph: PoseGraph) -> Poses:
+    """Return the pose of j as measured to where it is: Z^-1 T_i_j, Z^-1 T_world_j for one vertex alone."""
     alone = _is_unary(graph)[:, None]
     T_i_j = jax.tree.map(lambda single, both: jnp.where(alone, single, both), T_world_j, T_i_j)
-    return graph.measurement.inverse() @ T_i_j
+    return between(graph.measurement, T_i_j)
 
 
 def _residual(missed: Poses, T_world_j: Poses, graph: PoseGraph) -> Float[Array, "e d"]:

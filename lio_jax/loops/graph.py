@@ -83,6 +83,34 @@ def moved(poses: Poses, step: Float[Array, "n d"]) -> Poses:
     return poses @ type(poses).exp(jnp.roll(step, -3 if size == 6 else -1, axis=-1))
 
 
+def between(a: Poses, b: Poses) -> Poses:
+    """Return a^-1 b, of (n,) and (n,) poses.
+
+    In space column by column: each of jaxlie's own products, of quaternions and with points, costs XLA
+    as much as all of this.
+    """
+    if not isinstance(a, jaxlie.SE3):
+        return a.inverse() @ b
+    (numbers_a,), (numbers_b,) = jax.tree.leaves(a), jax.tree.leaves(b)
+    w, x, y, z, *from_t = jnp.moveaxis(numbers_a, -1, 0)
+    p, q, r, s, *to_t = jnp.moveaxis(numbers_b, -1, 0)
+    turn = [
+        w * p + x * q + y * r + z * s,
+        w * q - x * p - y * s + z * r,
+        w * r - y * p - z * q + x * s,
+        w * s - z * p - x * r + y * q,
+    ]
+    # R' v = v - 2 w (u x v) + 2 u x (u x v) with u the quaternion's vector
+    vx, vy, vz = (to - start for to, start in zip(to_t, from_t, strict=True))
+    cx, cy, cz = y * vz - z * vy, z * vx - x * vz, x * vy - y * vx
+    shift = [
+        vx + 2 * (y * cz - z * cy - w * cx),
+        vy + 2 * (z * cx - x * cz - w * cy),
+        vz + 2 * (x * cy - y * cx - w * cz),
+    ]
+    return jaxlie.SE3(jnp.stack(turn + shift, -1))
+
+
 def picked(poses: Poses, index: Int[Array, " k"]) -> Poses:
     """Return the poses at these places."""
     return jax.tree.map(lambda leaf: leaf[index], poses)

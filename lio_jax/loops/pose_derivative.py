@@ -10,11 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from lio_jax.core.implicit import Problem, implicit
 from lio_jax.core.implicit import Solution as Root
-from lio_jax.loops.block_cholesky import factorise, one_thread
+from lio_jax.loops.block_cholesky import factorise
 from lio_jax.loops.block_cholesky import solve as solve_factored
 from lio_jax.loops.descent import Limits
 from lio_jax.loops.factors import edge_costs, residuals
 from lio_jax.loops.graph import PoseGraph, Poses, moved, picked
+from lio_jax.loops.multifrontal import one_thread
 from lio_jax.loops.pose_graph import solve
 from lio_jax.loops.structure import Structure, structure_from, structure_of
 
@@ -127,12 +128,14 @@ def _solve_on_host(
     solved = columns.copy()
     if structure.count:
         with one_thread():
-            factor = factorise(structure.plan, _blocks(structure, hessians.reshape(-1, 2 * size, 2 * size)))
+            factor = factorise(structure.plan, *_blocks(structure, hessians.reshape(-1, 2 * size, 2 * size)))
             solved[:, free] = solve_factored(factor, columns[:, free].transpose(1, 2, 0)).transpose(2, 0, 1)
     return solved.reshape(right.shape).astype(right.dtype)
 
 
-def _blocks(structure: Structure, hessians: NDArray[np.float64]) -> NDArray[np.float64]:
+def _blocks(
+    structure: Structure, hessians: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the Hessian's blocks on the diagonal, then those of the pairs."""
     size = structure.tangent_size
     i, j = structure.unknown[structure.i], structure.unknown[structure.j]
@@ -142,4 +145,4 @@ def _blocks(structure: Structure, hessians: NDArray[np.float64]) -> NDArray[np.f
     np.add.at(diagonal, j, hessians[:, size:, size:])
     pairs = np.zeros((len(structure.pairs) + 1, size, size))
     np.add.at(pairs, structure.pair_of, np.where((i < j)[:, None, None], H_ij.transpose(0, 2, 1), H_ij))
-    return np.concatenate([diagonal[:-1], pairs[:-1]])
+    return diagonal[:-1], pairs[:-1]

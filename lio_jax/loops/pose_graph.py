@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.loops.block_cholesky import NotPositiveDefiniteError, factorise, one_thread
+from lio_jax.loops.block_cholesky import factorise
 from lio_jax.loops.block_cholesky import solve as solve_factored
 from lio_jax.loops.chordal import chordal_poses
 from lio_jax.loops.descent import Equations, Limits, descend
 from lio_jax.loops.graduated import Robust, graduate
 from lio_jax.loops.graph import PoseGraph, Poses, Solution
+from lio_jax.loops.multifrontal import NotPositiveDefiniteError, one_thread
 from lio_jax.loops.normal_equations import Padded, Point, padded, padded_poses, padded_weights, point_after
 from lio_jax.loops.structure import Structure, structure_of
 
@@ -68,7 +69,6 @@ def _solve(
 ) -> Solution:
     whole = padded(graph, structure)
     own = _point(whole, structure, whole.graph.poses, np.ones(len(structure.i)))
-    initial_cost = float(own.cost)
     poses = whole.graph.poses
     if start == "chordal":
         poses = padded_poses(chordal_poses(graph, structure), len(whole.graph.fixed))
@@ -77,7 +77,7 @@ def _solve(
     else:
         weights = np.ones(len(structure.i))
         descent = descend(whole, structure, poses, padded_weights(weights, whole), limits)
-        if float(descent.point.cost) > initial_cost:
+        if float(descent.point.cost) > float(own.cost):
             again = descend(whole, structure, whole.graph.poses, padded_weights(weights, whole), limits)
             descent = again._replace(iterations=descent.iterations + again.iterations)
     return Solution(
@@ -116,14 +116,13 @@ def marginal_covariances(
     whole = padded(graph, structure)
     poses = padded_poses(solution.poses, len(whole.graph.fixed))
     equations = Equations.at(_point(whole, structure, poses, np.asarray(solution.weights)), structure)
-    blocks = np.concatenate([equations.diagonal, equations.pairs])
     size = structure.tangent_size
     covariances = np.zeros((len(vertices), size, size))
     unknown = structure.unknown[np.asarray(vertices, np.int64)]
     asked = np.flatnonzero(unknown < structure.count)
     try:
         with one_thread():
-            factor = factorise(structure.plan, blocks)
+            factor = factorise(structure.plan, equations.diagonal, equations.pairs)
             for some in np.array_split(asked, -(-len(asked) // _VERTICES_AT_ONCE) or 1):
                 columns = np.zeros((structure.count, size, len(some), size))
                 columns[unknown[some], :, np.arange(len(some))] = np.eye(size)

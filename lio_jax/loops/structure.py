@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from lio_jax.loops.block_cholesky import Plan, plan_of
-from lio_jax.loops.elimination_tree import EliminationTree, elimination_tree
+from lio_jax.loops.block_cholesky import Order, Plan, order_of, plan_of
 from lio_jax.loops.graph import POSITION, PRIOR, PoseGraph
 
 
@@ -66,19 +65,19 @@ class Structure:
         return self._pairs[1]
 
     @cached_property
-    def tree(self) -> EliminationTree:
+    def order(self) -> Order:
         """Order of elimination."""
-        return elimination_tree(self.count, self.pairs)
+        return order_of(self.count, self.pairs)
 
     @cached_property
     def plan(self) -> Plan:
         """For matrices with one row per unknown tangent."""
-        return plan_of(self.count, self.pairs, self.tangent_size, self.tree)
+        return plan_of(self.order, self.tangent_size)
 
     @cached_property
     def plan_of_coordinates(self) -> Plan:
         """For matrices with 3 rows per unknown in space, 2 in the plane."""
-        return plan_of(self.count, self.pairs, 3 if self.tangent_size == 6 else 2, self.tree)
+        return plan_of(self.order, 3 if self.tangent_size == 6 else 2)
 
 
 def structure_of(graph: PoseGraph, used: NDArray[np.bool_] | None = None) -> Structure:

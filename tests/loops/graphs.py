@@ -87,6 +87,31 @@ def with_edges(graph, i, j, measurement, information, kind, lever=None):
     )
 
 
+def with_priors_and_positions(graph, rng, priors=(4, 19), positions=(7, 11, 25), lever=()):
+    """Return the graph tied to the world by measurements instead of a fixed vertex."""
+    size = graph.information.shape[-1]
+    truth = graph.poses
+    if priors:
+        poses = measured(
+            truth, np.zeros((len(priors), 2), int), random_information(len(priors), size, rng), rng
+        )
+        poses = at(truth, list(priors)) @ poses
+        graph = with_edges(graph, priors, priors, poses, random_information(len(priors), size, rng), PRIOR)
+    if positions:
+        information = random_information(len(positions), size, rng)
+        turning = 3 if size == 6 else 1
+        information[:, :turning] = information[:, :, :turning] = 0
+        own = at(truth, list(positions))
+        levers = np.tile(lever, (len(positions), 1)) if len(lever) else None
+        shifts = numbers_of(own).copy()
+        if levers is not None:
+            shifts[:, turning - size :] += np.einsum("eij,ej->ei", rotation_matrices(own), levers)
+        shifts[:, turning - size :] += 0.05 * rng.normal(size=(len(positions), size - turning))
+        fixes = type(truth)(jnp.asarray(shifts))
+        graph = with_edges(graph, positions, positions, fixes, information, POSITION, levers)
+    return with_poses(graph, graph.poses, np.zeros(len(graph.fixed), bool))
+
+
 def with_poses(graph, poses, fixed=None):
     fixed = graph.fixed if fixed is None else jnp.asarray(fixed)
     return PoseGraph(

@@ -1,6 +1,5 @@
 """Pose graphs against gtsam, known truth and the optima of recorded graphs."""
 
-import gtsam
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -10,22 +9,21 @@ from lio_jax.core.errors import LioJaxError
 from lio_jax.loops.chordal import chordal_poses, edges_at
 from lio_jax.loops.factors import linearise, residuals
 from lio_jax.loops.g2o_reader import read_g2o
-from lio_jax.loops.graph import LOOP, POSITION, PRIOR, moved
-from lio_jax.loops.host_poses import numbers_of, rotation_matrices, translations
+from lio_jax.loops.graph import LOOP, POSITION, moved
+from lio_jax.loops.host_poses import numbers_of, translations
 from lio_jax.loops.normal_equations import point_after
 from lio_jax.loops.pose_graph import Limits, compile_for, marginal_covariances, solve
 from lio_jax.loops.structure import structure_of
+from tests.loops.agreement import agrees_on_covariances, agrees_with_gtsam
 from tests.loops.graphs import (
     at,
     graph_of,
     gtsam_graph,
     gtsam_optimum,
     gtsam_values,
-    measured,
-    random_information,
     walk,
-    with_edges,
     with_poses,
+    with_priors_and_positions,
 )
 from tests.shared_data import SHARED_DATA, needs_shared
 
@@ -39,31 +37,6 @@ def graph(request):
     return graph_of(walk(request.param, 30, rng), LOOPS, rng)
 
 
-def with_priors_and_positions(graph, rng, priors=(4, 19), positions=(7, 11, 25), lever=()):
-    """Return the graph tied to the world by measurements instead of a fixed vertex."""
-    size = graph.information.shape[-1]
-    truth = graph.poses
-    if priors:
-        poses = measured(
-            truth, np.zeros((len(priors), 2), int), random_information(len(priors), size, rng), rng
-        )
-        poses = at(truth, list(priors)) @ poses
-        graph = with_edges(graph, priors, priors, poses, random_information(len(priors), size, rng), PRIOR)
-    if positions:
-        information = random_information(len(positions), size, rng)
-        turning = 3 if size == 6 else 1
-        information[:, :turning] = information[:, :, :turning] = 0
-        own = at(truth, list(positions))
-        levers = np.tile(lever, (len(positions), 1)) if len(lever) else None
-        shifts = numbers_of(own).copy()
-        if levers is not None:
-            shifts[:, turning - size :] += np.einsum("eij,ej->ei", rotation_matrices(own), levers)
-        shifts[:, turning - size :] += 0.05 * rng.normal(size=(len(positions), size - turning))
-        fixes = type(truth)(jnp.asarray(shifts))
-        graph = with_edges(graph, positions, positions, fixes, information, POSITION, levers)
-    return with_poses(graph, graph.poses, np.zeros(len(graph.fixed), bool))
-
-
 def test_cost_is_gtsams(graph):
     graph = with_priors_and_positions(graph, np.random.default_rng(0))
     rng = np.random.default_rng(1)
@@ -73,19 +46,6 @@ def test_cost_is_gtsams(graph):
     there = with_poses(graph, moved)
     expected = gtsam_graph(graph).error(gtsam_values(moved))
     assert float(solve(there, limits=Limits(iterations=0)).initial_cost) == pytest.approx(expected, rel=1e-9)
-
-
-def agrees_with_gtsam(graph, solution):
-    factors = gtsam_graph(graph)
-    theirs = gtsam_optimum(factors, gtsam_values(solution.poses))
-    assert solution.status == "converged"
-    assert float(solution.cost) == pytest.approx(factors.error(theirs), rel=1e-9)
-    for number, (R, t) in enumerate(
-        zip(rotation_matrices(solution.poses), translations(solution.poses), strict=True)
-    ):
-        pose = theirs.atPose3(number) if len(t) == 3 else theirs.atPose2(number)
-        np.testing.assert_allclose(t, pose.translation(), atol=1e-5)
-        np.testing.assert_allclose(R, pose.rotation().matrix(), atol=1e-5)
 
 
 @pytest.mark.parametrize("start", ["chordal", "poses"])
@@ -208,16 +168,6 @@ def test_parts_are_solved_each_by_itself(graph):
 def test_covariances_are_gtsams(graph):
     graph = with_priors_and_positions(graph, np.random.default_rng(8))
     agrees_on_covariances(graph, solve(graph))
-
-
-def agrees_on_covariances(graph, solution):
-    marginals = gtsam.Marginals(gtsam_graph(graph), gtsam_values(solution.poses))
-    chosen = [0, 7, 19, 29]
-    for number, ours in zip(chosen, marginal_covariances(graph, solution, chosen), strict=True):
-        theirs = marginals.marginalCovariance(number)
-        if len(theirs) == 3:
-            theirs = np.roll(theirs, 1, axis=(0, 1))
-        np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-6 * np.abs(theirs).max())
 
 
 def test_a_fixed_pose_has_no_covariance(graph):
