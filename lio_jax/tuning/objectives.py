@@ -46,8 +46,8 @@ class MeanOverScans(eqx.Module):
 class MarginalLikelihood(eqx.Module):
     """The negative log marginal likelihood of a recording's measurements per scan, by a smoother.
 
-    It asks how probable the inertial samples and the scan matches are whatever the states, and so does not
-    book an error of one scan match on the inertial samples as innovations do.
+    It asks how probable inertial samples and scan matches are whatever the states. The errors of the matches
+    count as white: what the map hands on of them from scan to scan is booked on the samples.
     """
 
     skip: int = eqx.field(static=True, default=0)

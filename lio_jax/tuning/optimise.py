@@ -70,10 +70,12 @@ def scoring(evaluate: Evaluate, x: Vector, bounds: Bounds, iterations: int) -> N
 def fisher_information(result: Evaluated) -> NDArray[np.float64]:
     """Return the scores' spread about their mean, regular where a parameter has no effect.
 
-    About their mean: what all scans ask for alike, the gradient, tells nothing of the curvature.
+    About their mean: what all scans ask for alike, the gradient, tells nothing of the curvature. Scans that
+    did not count have no score, not one of zero.
     """
-    scores = result.scores - np.mean(result.scores, axis=0)
-    information = scores.T @ scores
+    scores = result.scores[np.any(result.scores != 0, axis=1)]
+    away = scores - np.sum(scores, axis=0) / max(len(scores), 1)
+    information = away.T @ away
     return information + np.diag(np.where(np.diag(information) > 0, 1e-9 * np.diag(information), 1.0))
 
 
