@@ -30,7 +30,9 @@ class TrajectoryLog:
         nav, state = tracked.nav, tracked.output.covariance
         match = _covariance(tracked) if self._rows else np.zeros((6, 6))
         self._matches.append(match)
-        pose = match if state is None else np.asarray(state)[:6, :6]
+        # copies: a view would keep the device's memory around it
+        whole = {} if state is None else {"state_covariance": np.array(state)}
+        pose = whole["state_covariance"][:6, :6] if whole else match
         self._rows.append(
             {
                 "stamps_ns": np.int64(tracked.stamp_ns),
@@ -41,9 +43,9 @@ class TrajectoryLog:
                 "extrinsic": pose_matrix(nav.T_imu_lidar.wxyz_xyz),
                 "time_offset": nav.time_offset,
                 "covariance": pose,
-                "nis": np.asarray(tracked.output.nis),
-                "nis_dof": np.asarray(tracked.output.nis_dof),
-                **({} if state is None else {"state_covariance": np.asarray(state)}),
+                "nis": np.array(tracked.output.nis),
+                "nis_dof": np.array(tracked.output.nis_dof),
+                **whole,
             }
         )
 
