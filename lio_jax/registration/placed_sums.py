@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lio_jax.core.implicit import known
+
 Rows = Callable[[Array, Array, Array, Any], Array]
 """``(arm (3, k), shift (3,), scales (s,), constants) -> (m, k)``: what each point adds to m sums. Its place
 in world axes is ``arm`` from the sensor and ``arm + shift`` from the map's origin."""
@@ -37,6 +39,9 @@ def placed_sums(
         scales: anything smooth that all points share.
         constants: a pytree without a derivative.
     """
+    # zeros are for the products with the pose's tangents; a row that counts keeps its point
+    finite = jax.lax.stop_gradient(jnp.where(jnp.isfinite(points), points, 0.0))
+    points = known(finite, lambda points: points, points)
     return _known(total, rows, points, R_world_lidar, shift, scales, constants)
 
 

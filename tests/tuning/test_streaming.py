@@ -18,11 +18,23 @@ from lio_jax.tuning.streaming import StreamingGradient
 from lio_jax.tuning.values import StreamingValues
 from tests.tuning.recordings import SCANS, TIGHT, DoubleRecording, drive, settings
 
-STEPS = {"imu.gyro_bias_walk": 1e-3, "imu.accel_bias_walk": 1e-3, "extrinsics": 1e-8, "": 1e-5}
+STEPS = {
+    "imu.gyro_bias_walk": 1e-3,
+    "imu.accel_bias_walk": 1e-3,
+    "imu.gravity": 1e-6,
+    "extrinsics": 1e-8,
+    "": 1e-5,
+}
 """Small where points move, lest they find another plane; large where hardly anything does."""
 NOISE = 2e-10
 """Of a total, because solves end at a step of 1e-12 and not of 0."""
-SMOOTHER_STEPS = {**STEPS, "imu.gyro_noise": 1e-2, "imu.accel_noise": 1e-2, "extrinsics": 1e-6}
+SMOOTHER_STEPS = {
+    **STEPS,
+    "imu.gyro_noise": 1e-2,
+    "imu.accel_noise": 1e-2,
+    "imu.gravity": 1e-5,
+    "extrinsics": 1e-6,
+}
 SMOOTHER_NOISE = 1e-8
 """Information of states that spans sixteen orders of magnitude leaves fewer digits."""
 
