@@ -42,18 +42,18 @@ def placed_sums(
     # zeros are for the products with the pose's tangents; a row that counts keeps its point
     finite = jax.lax.stop_gradient(jnp.where(jnp.isfinite(points), points, 0.0))
     points = known(finite, lambda points: points, points)
-    return _known(total, rows, points, R_world_lidar, shift, scales, constants)
+    return _summed(total, rows, points, R_world_lidar, shift, scales, constants)
 
 
 @eqx.filter_custom_jvp
-def _known(
+def _summed(
     total: Array, rows: Rows, points: Array, R: Array, shift: Array, scales: Array, constants: Any
 ) -> Array:
     return total
 
 
-@_known.def_jvp
-def _known_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+@_summed.def_jvp
+def _summed_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     total, rows, points, R, shift, scales, constants = primals
     points_dot, R_dot, shift_dot, scales_dot = tangents[2:6]
     arm = R @ points.T
