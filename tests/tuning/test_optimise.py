@@ -145,3 +145,11 @@ def test_a_start_that_is_not_finite_is_refused(tmp_path):
 
     with pytest.raises(LioJaxError, match="not finite at the start"):
         session(tmp_path, broken).run("scoring", BEST, WIDE, 5, 0)
+
+
+def test_the_information_is_the_scatter_of_the_scores_of_scans_that_count():
+    scores = np.random.default_rng(6).normal([3.0, -1.0], [0.5, 2.0], (200, 2))
+    silent = np.concatenate([np.zeros((10, 2)), scores])
+    result = Evaluated(0.0, silent.mean(0), silent, 0, len(silent))
+    expected = np.cov(scores.T, bias=True) * len(scores)
+    np.testing.assert_allclose(fisher_information(result), expected, rtol=1e-6)
