@@ -2,7 +2,7 @@
 
 What a smoother's evidence takes for white noise of a scan match may be something else: the world of the first
 scan is tilted by what its levelling missed; the map drifts while the vehicle drives; and a sweep compensated
-along a predicted motion keeps that motion's errors (:mod:`lio_jax.imu.sweep_lag`). Here each of them can be
+along a predicted motion keeps that motion's errors (:mod:`lio_jax.imu.sweep_mean_error`). Here each can be
 modelled, in states of their own and in the correlation of a match with the link before it. All is linearised
 once, at the states smoothed with white noise.
 """
@@ -15,21 +15,20 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from lio_jax.core.block_tridiagonal import BlockTridiagonal, factorise, log_determinant, solve
 from lio_jax.core.error_state import BIASES, POSITION, ROTATION, VELOCITY
+from lio_jax.core.geometry import rotation_matrix
 from lio_jax.core.params import ImuParams
-from lio_jax.core.rotation import rotation_matrix
+from lio_jax.estimation.block_tridiagonal import BlockTridiagonal, factorise, log_determinant, solve
 from lio_jax.estimation.chain import Chain
 from lio_jax.estimation.imu_factor import imu_information, imu_residual
 from lio_jax.estimation.marginal_prior import LOG_2PI
 from lio_jax.estimation.motion_state import DOF, POSE_DOF, MotionState, local_jacobian
 from lio_jax.estimation.pose_logarithm import log_and_jacobian
 from lio_jax.estimation.quadratic import Quadratic
-from lio_jax.imu.discretise import discretise
+from lio_jax.imu.discretise import discretise, process_noise
 from lio_jax.imu.increments import NAV_DOF, accumulate, nav_transition, sensitivity
-from lio_jax.imu.process_noise import process_noise
 from lio_jax.imu.sampling import Intervals
-from lio_jax.imu.sweep_lag import LAG_DOF, lag_of_inputs, still_to_show
+from lio_jax.imu.sweep_mean_error import LAG_DOF, lag_of_inputs, still_to_show
 
 WORLD_SIGMA = jnp.repeat(jnp.array([0.02, 0.001]), 3)
 """Of the world's attitude and position in that of gravity, rad and m, where they are estimated."""

@@ -78,7 +78,7 @@ class Workshop:
     ) -> None:
         from lio_jax.core.settings import with_overrides
         from lio_jax.tuning.loss import Loss
-        from lio_jax.tuning.named_objectives import objective_named
+        from lio_jax.tuning.objectives import objective_named
         from lio_jax.tuning.parameters import free_parameters
         from lio_jax.tuning.values import StreamingValues
 
@@ -112,7 +112,7 @@ class Workshop:
 
     def tuned(self, world: str, seed: int, factor: float, iterations: int) -> Found:
         """Tune on one recording."""
-        from lio_jax.tuning.optimise import Bounds, fisher_information, scoring
+        from lio_jax.tuning.optimise import Bounds, fisher_information, fisher_scoring
 
         recording, _ = self.recording(world, seed)
         evaluated: list[tuple[np.ndarray, Any]] = []
@@ -122,7 +122,7 @@ class Workshop:
             return evaluated[-1][1]
 
         x = self.start(factor)
-        scoring(evaluate, x, Bounds(x - np.log(1e3), x + np.log(1e3)), iterations)
+        fisher_scoring(evaluate, x, Bounds(x - np.log(1e3), x + np.log(1e3)), iterations)
         x, last = evaluated[-1]
         sigma = np.sqrt(np.diag(np.linalg.inv(fisher_information(last))))
         losses = [result.value for _, result in evaluated]
@@ -133,7 +133,7 @@ class Workshop:
         from lio_jax.core.error_state import local
         from lio_jax.evaluation.alignment import align, position_errors
         from lio_jax.evaluation.consistency import nees
-        from lio_jax.run.track import CompiledStep, stepped
+        from lio_jax.run.track import CompiledStep, run_steps
 
         recording, sequence = self.recording(world, seed)
         arrays, motion = sequence.truth_arrays(), sequence.truth()
@@ -141,7 +141,7 @@ class Workshop:
         step.params = self.settings.params() if x is None else self.free(jnp.asarray(x))
         poses, truth, errors, covariances, nis = [], [], [], [], []
         anchor = None
-        for fed, state, output in stepped(step, recording.feed()):
+        for fed, state, output in run_steps(step, recording.scan_inputs()):
             nav, true = state.nav, recording.truth_at(fed.end_ns).T_world_imu
             if anchor is None:
                 # the first pose defines the map's frame

@@ -106,14 +106,14 @@ def fitted(variant: Variant, recordings: list[Terms], factor: float) -> tuple[np
 
 def gathered(shop: Workshop, world: str, seed: int) -> tuple[Sweep, jaxlie.SE3, jaxlie.SE3]:
     """Run lio_sam and return what was measured: sweeps, matched poses, and the true ones."""
-    from lio_jax.run.track import CompiledStep, stepped
+    from lio_jax.run.track import CompiledStep, run_steps
 
     recording, _ = shop.recording(world, seed)
     step = CompiledStep(shop.settings)
     cut = jax.jit(sample_intervals)
     sweeps, matched, true = [], [], []
     latest = None
-    for fed, state, _ in stepped(step, recording.feed()):
+    for fed, state, _ in run_steps(step, recording.scan_inputs()):
         truth = recording.truth_at(fed.end_ns)
         if not bool(truth.known):
             break

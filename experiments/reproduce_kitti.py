@@ -17,7 +17,7 @@ from typing import Any
 
 import yaml
 
-from lio_jax.ablation.comparison import Comparison, compare
+from lio_jax.ablation.ranking import Comparison, compare
 from lio_jax.ablation.spec import Spec, load_spec
 from lio_jax.ablation.store import Store
 from lio_jax.ablation.tasks import tasks_of

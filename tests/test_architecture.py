@@ -17,6 +17,7 @@ FLOORS = {
     "imu": 2,
     "lidar": 2,
     "mapping": 2,
+    "pose_graph": 2,
     "registration": 3,
     "estimation": 3,
     "loops": 3,

@@ -44,7 +44,7 @@ def recorded(path: Path, name: str | None, start: int, count: int | None) -> Dat
         count: number of scans; None: all.
     """
     from lio_jax.core.config import DataConfig
-    from lio_jax.data.open import open_sequence
+    from lio_jax.data.detect import open_sequence
 
     sequence = open_sequence(path, DataConfig())
     scans = [scan for scan in sequence.scans(start, count) if len(scan.points)]

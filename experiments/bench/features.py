@@ -56,7 +56,7 @@ def _scans() -> "dict[str, tuple[LidarScan, tuple[int, int, int]]]":
     from datasets import REAL
 
     from lio_jax.core.config import DataConfig
-    from lio_jax.data.open import open_sequence
+    from lio_jax.data.detect import open_sequence
     from lio_jax.sim.sequence import SimulatedSequence
 
     scans = {
@@ -81,7 +81,7 @@ def _programs(scan: "LidarScan", sizes: tuple[int, int, int]) -> dict[str, dict[
     from lio_jax.core.params import params_from_values
     from lio_jax.lidar.features import lio_sam_features, lio_sam_rings, loam_features, loam_rings
     from lio_jax.lidar.range_image import range_image
-    from lio_jax.run.feed import padded
+    from lio_jax.run.scan_inputs import padded
 
     rings, room, columns = sizes
     scan_on_device = jax.tree.map(jnp.asarray, padded(scan, None, Config().lidar))

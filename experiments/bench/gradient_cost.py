@@ -50,8 +50,8 @@ def measured(scans: int) -> dict[str, float]:
     from lio_jax import ImuModel, SimulatedSequence
     from lio_jax.core.settings import recipe_settings
     from lio_jax.run.run import peak_rss_mb, settings_for
-    from lio_jax.run.track import CompiledStep, stepped
-    from lio_jax.tuning.named_objectives import objective_named
+    from lio_jax.run.track import CompiledStep, run_steps
+    from lio_jax.tuning.objectives import objective_named
     from lio_jax.tuning.parameters import free_parameters
     from lio_jax.tuning.recording import Recording
     from lio_jax.tuning.streaming import StreamingGradient
@@ -59,9 +59,9 @@ def measured(scans: int) -> dict[str, float]:
     class TimedRecording(Recording):
         """Notes how long each scan's user takes until it asks for the next one."""
 
-        def feed(self):
+        def scan_inputs(self):
             self.ms = []
-            for fed in super().feed():
+            for fed in super().scan_inputs():
                 start = time.perf_counter()
                 yield fed
                 self.ms.append((time.perf_counter() - start) * 1e3)
@@ -73,7 +73,7 @@ def measured(scans: int) -> dict[str, float]:
     gradient = StreamingGradient(settings.recipe, settings.config, free, objective_named("pose").objective)
     gradient(free.first(), recording)
     gradient_ms = float(np.median(recording.ms[5:]))
-    for _, state, output in stepped(CompiledStep(settings), recording.feed()):
+    for _, state, output in run_steps(CompiledStep(settings), recording.scan_inputs()):
         jax.block_until_ready((state.nav, output))
     plain_ms = float(np.median(recording.ms[5:]))
     return {

@@ -11,9 +11,9 @@ from systems import Pose
 
 from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.data.sequence import LidarScan, Sequence
-from lio_jax.run.feed import bucket_for
+from lio_jax.run.fitted_settings import with_sensor_sizes
 from lio_jax.run.run import imu_feed
-from lio_jax.run.sensor_sizes import with_sensor_sizes
+from lio_jax.run.scan_inputs import bucket_for
 from lio_jax.run.track import CompiledStep, track
 
 _OPENING = 3

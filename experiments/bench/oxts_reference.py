@@ -6,7 +6,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from lio_jax.data.oxts import read_oxts
+from lio_jax.data.kitti_raw import read_oxts
 from lio_jax.data.trajectory import Trajectory
 
 _VELOCITY_NORTH, _VELOCITY_EAST, _VELOCITY_UP = 6, 7, 10

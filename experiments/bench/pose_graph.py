@@ -21,7 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 if TYPE_CHECKING:
-    from lio_jax.loops.graph import PoseGraph
+    from lio_jax.pose_graph.graph import PoseGraph
 
 _SYSTEMS = ("ours", "gtsam", "odometry")
 RECORDED = ("sphere2500", "parking-garage")
@@ -73,7 +73,7 @@ def _read(path: Path) -> "PoseGraph":
     import equinox as eqx
     import jax.numpy as jnp
 
-    from lio_jax.loops.g2o_reader import read_g2o
+    from lio_jax.pose_graph.g2o import read_g2o
 
     graph = read_g2o(path).graph
     return eqx.tree_at(lambda graph: graph.fixed, graph, jnp.arange(len(graph.fixed)) == 0)
@@ -114,8 +114,7 @@ def _simulated(translations: np.ndarray, pairs: np.ndarray, sigma: np.ndarray) -
     import jaxlie
     from scipy.spatial.transform import Rotation
 
-    from lio_jax.loops.graph import LOOP, ODOMETRY, PoseGraph, moved, picked
-    from lio_jax.loops.host_poses import poses_from
+    from lio_jax.pose_graph.graph import LOOP, ODOMETRY, PoseGraph, moved, picked, poses_from
 
     ahead = np.gradient(translations, axis=0)
     yaw, pitch = np.arctan2(ahead[:, 1], ahead[:, 0]), -np.arcsin(ahead[:, 2] / np.linalg.norm(ahead, axis=1))
@@ -142,7 +141,7 @@ def _simulated(translations: np.ndarray, pairs: np.ndarray, sigma: np.ndarray) -
 def _measured(name: str, graph: "PoseGraph", repeats: int) -> dict[str, Any]:
     import gtsam
 
-    from lio_jax.loops.pose_graph import compile_for, solve
+    from lio_jax.pose_graph.pose_graph import compile_for, solve
     from tests.loops.graphs import gtsam_graph, gtsam_values
 
     begin = time.perf_counter()

@@ -11,8 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lio_jax.loops.keyframe import Keyframe
-from lio_jax.loops.surroundings import thinned
+from lio_jax.loops.keyframe import Keyframe, thinned
 from lio_jax.sim.lidar import Lidar, Sweep, spinning_lidar, sweep
 from lio_jax.sim.raycast import cast
 from lio_jax.sim.worlds import Counts, World, counts_along, nearest_part

@@ -12,14 +12,13 @@ import jax.numpy as jnp
 from lio_jax.core.config import Config
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.settings import Settings
+from lio_jax.core.xla import PerShape
 from lio_jax.data.prefetch import prefetched
 from lio_jax.data.sequence import Sequence
 from lio_jax.recipes import recipe_named
-from lio_jax.run.compilation import PerShape
-from lio_jax.run.overflow import Overflow
+from lio_jax.run.logs import Overflow, TrajectoryLog
 from lio_jax.run.run import check_start, failure_record, imu_feed, percentiles
-from lio_jax.run.track import Judged, Tracked, feed, stepped
-from lio_jax.run.trajectory_log import TrajectoryLog
+from lio_jax.run.track import ResultBuilder, ScanResult, run_steps, scan_inputs
 
 
 class BatchPrograms:
@@ -80,7 +79,7 @@ def run_batch(
     runs = [_Run(one, start) for one in settings]
     scans: Any = prefetched(sequence.scans(start, count), first.config.data.prefetch)
     compiled = programs.compile_s
-    for fed, state, output in stepped(_BatchStep(programs, stacked), feed(first, scans, imu)):
+    for fed, state, output in run_steps(_BatchStep(programs, stacked), scan_inputs(first, scans, imu)):
         nav, seen = jax.device_get((state.nav, output))
         step_s = time.perf_counter() - fed.padded_at - (programs.compile_s - compiled)
         compiled = programs.compile_s
@@ -104,13 +103,13 @@ class _Run:
 
     def __init__(self, settings: Settings, start: int) -> None:
         self.log = TrajectoryLog()
-        self.judged = Judged(settings)
+        self.judged = ResultBuilder(settings)
         self._start = start
         self._overflow = Overflow(settings)
         self._failures: list[dict[str, Any]] = []
         self._stage_ms: dict[str, list[float]] = {"step": [], "total": []}
 
-    def add(self, tracked: Tracked) -> None:
+    def add(self, tracked: ScanResult) -> None:
         self.log.append(tracked)
         self._overflow.add(tracked)
         if tracked.failure:
@@ -135,7 +134,7 @@ class _BatchStep:
 
     def __init__(self, programs: BatchPrograms, params: Any) -> None:
         self.initial_state = partial(programs.init, params)
-        self._moving_as = programs.recipe.moving_as
+        self._moving_as = programs.recipe.with_velocity_of
         self._step = partial(programs.step, params)
 
     def restarted(self, state: Any, imu: Any) -> Any:

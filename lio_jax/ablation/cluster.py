@@ -1,19 +1,26 @@
-"""Where the runs are made: workers on this machine, or a dask cluster that runs already."""
+"""Loaded by dask into each worker process of this machine."""
 
 import asyncio
 import importlib.util
 import logging
 import os
+import signal
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lio_jax.core.errors import LioJaxError, UsageError
 
 if TYPE_CHECKING:
     from distributed import Client, Nanny, SpecCluster
+
+
+def dask_setup(worker: Any) -> None:
+    """Leave Ctrl-C, which a terminal sends to all processes, to the command."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
 
 _WORKER_BYTES = 2 << 30
 """Memory that a worker is given room for."""
@@ -110,7 +117,7 @@ class Crew:
                 dashboard=False,
                 host="127.0.0.1",
                 silence_logs=logging.CRITICAL,
-                preload=["lio_jax.ablation.worker_process"],
+                preload=["lio_jax.ablation.cluster"],
                 env=self._environments[number],
             )
             for number in gone

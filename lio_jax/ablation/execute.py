@@ -1,15 +1,21 @@
-"""Have the tasks done by dask workers; what is done, and what failed, is read from the store."""
+"""Run the tasks of an ablation: on worker processes, or in the calling process for a notebook."""
 
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError
+from pathlib import Path
 from typing import Any
 
 from lio_jax.ablation.cluster import Workers
-from lio_jax.ablation.store import Store
-from lio_jax.ablation.tasks import Task, pieces
+from lio_jax.ablation.perform import perform
+from lio_jax.ablation.ranking import Comparison, compare
+from lio_jax.ablation.spec import load_spec
+from lio_jax.ablation.store import Store, opened
+from lio_jax.ablation.tasks import Task, pieces, tasks_of
 from lio_jax.core.errors import LioJaxError
+from lio_jax.data.whole_output import disk_errors_said
+from lio_jax.run.folder import write_text
 
 Perform = Callable[[tuple[Task, ...], Store], None]
 """Leaves each task done or failed in the store, in order."""
@@ -107,3 +113,27 @@ def _work(prepare: Callable[[], None], perform: Perform, tasks: tuple[Task, ...]
 
 def _ended(store: Store, keys: Sequence[str]) -> set[str]:
     return {*store.done(keys), *store.failed(keys)}
+
+
+def run_ablation(spec_path: Path, out: Path) -> Comparison:
+    """Run what a specification asks for, one run after the other, and compare.
+
+    As ``lio-jax ablate`` does it, but with JAX as the caller has set it up. What ``out`` holds already is not
+    run again.
+
+    Args:
+        spec_path: YAML file; see :mod:`lio_jax.ablation.spec`.
+        out: folder of the results, new or of an earlier ablation.
+
+    Raises:
+        UsageError: the specification is wrong, or the folder is taken.
+        LioJaxError: nothing can be written any more.
+    """
+    spec = load_spec(spec_path)
+    tasks = tasks_of(spec)
+    with opened(out) as store:
+        with disk_errors_said(out / "spec.yaml"):
+            write_text(out / "spec.yaml", spec.text)
+        for piece in pieces(tasks, 1):
+            perform(piece, store)
+        return compare(spec, tasks, store)

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from lio_jax.ablation.batch import BatchPrograms, run_batch, same_batch
-from lio_jax.ablation.kept_sequence import KeptSequence
 from lio_jax.ablation.results import write_result
-from lio_jax.ablation.sources import Source
+from lio_jax.ablation.sources import KeptSequence, Source
 from lio_jax.ablation.store import DiskError, Store
 from lio_jax.ablation.tasks import Task
 from lio_jax.core.config import Config, DataConfig

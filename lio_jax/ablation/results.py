@@ -8,13 +8,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lio_jax.ablation.metric_names import numbers_in
+from lio_jax.ablation.spec import numbers_in
 from lio_jax.ablation.store import Store
 from lio_jax.ablation.tasks import Task, code_version
 from lio_jax.core.files import atomic_path
 from lio_jax.core.settings import Settings
-from lio_jax.run.environment import processor, usable_cores
-from lio_jax.run.folder import write_json
+from lio_jax.run.folder import processor, usable_cores, write_json
 
 if TYPE_CHECKING:
     import pyarrow as pa

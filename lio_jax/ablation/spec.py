@@ -1,42 +1,66 @@
-"""What an ablation is told: a YAML file, checked strictly.
+"""The numbers that a run's metrics.json holds, by their paths."""
 
-For example::
-
-    recipe: default                       # or a settings file; what the variants change
-    set: {config.map.capacity: 65536}     # holds for all of them
-    sequences:
-      - {sim: street, duration: 10}
-      - path: $KITTI/sequences/{00..10}   # relative to this file; scans: 200 and start: 50 take a part
-    seeds: [0, 1, 2]                      # of the simulated ones
-    grid: {params.map.voxel_size: [0.8, 1.2], config.imu.use: [true, false]}
-    zip: {...}
-    random: {count: 20, seed: 0, params.imu.gyro_noise: {log_uniform: [1.0e-4, 1.0e-2]}}
-    list: [{name: ours}, {recipe: loam}]
-    baseline: {}                          # overrides; what the others are compared with; else the first
-    metrics: [ate.rmse, scan_ms.total.median]   # columns of the table; the first one ranks
-    keep: trajectory                      # or everything: the whole run folder
-    batch: auto                           # parameter sets in one program: auto, or a number
-
-``grid`` takes all combinations, ``zip`` goes through its lists together; all that is asked for is compared.
-"""
-
+import dataclasses
 import difflib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import yaml
 
-from lio_jax.ablation.metric_names import DEFAULT_METRICS, METRICS
-from lio_jax.ablation.sources import (
-    RECORDED_KEYS,
-    SIMULATED_KEYS,
-    Source,
-    recorded,
-    simulated,
-)
+from lio_jax.ablation.sources import RECORDED_KEYS, SIMULATED_KEYS, Source, recorded, simulated
 from lio_jax.ablation.variants import KINDS, Overrides, Variant, overrides_of, variants
 from lio_jax.core.errors import UsageError
+from lio_jax.evaluation.kitti_segments import SegmentErrors
+from lio_jax.evaluation.trajectory_error import PoseError
+
+_STAGES = ("decode", "pad", "step", "record", "total")
+
+METRICS: dict[str, str] = {
+    "failed_scans": "",
+    "scans": "",
+    "path_length_m": "m",
+    **{
+        f"{group}.{field.name}": "" if field.name == "samples" else "rad" if "rotation" in field.name else "m"
+        for group in ("ate", "rpe")
+        for field in dataclasses.fields(PoseError)
+    },
+    **{
+        f"{group}.{field.name}": {"translation_percent": "%", "rotation_deg_per_m": "deg/m"}.get(
+            field.name, ""
+        )
+        for group in ("kitti", "kitti_short_10_80m")
+        for field in dataclasses.fields(SegmentErrors)
+    },
+    **{f"scan_ms.{stage}.{value}": "ms" for stage in _STAGES for value in ("median", "p95", "p99")},
+    "compile_s": "s",
+    "wall_s": "s",
+}
+"""By path, with units; of all of them less is better, or they are mere counts."""
+
+DEFAULT_METRICS = ("ate.rmse", "ate.rotation_rmse", "rpe.rmse", "failed_scans", "scan_ms.total.median")
+
+TIME = "scan_ms.total.median"
+"""What a scan costs."""
+
+
+def is_timing(metric: str) -> bool:
+    """Return whether a metric differs from run to run on one machine."""
+    return METRICS.get(metric) in ("ms", "s")
+
+
+def numbers_in(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """Return the numbers of a metrics.json by the names above."""
+    flat = {"failed_scans": float(len(metrics.get("failures", ())))}
+    for name in METRICS:
+        value: Any = metrics
+        for part in name.split("."):
+            value = value.get(part) if isinstance(value, Mapping) else None
+        if isinstance(value, int | float):
+            flat[name] = float(value)
+    return flat
+
 
 Keep = Literal["trajectory", "everything"]
 

@@ -11,9 +11,9 @@ from typing import Any
 from tqdm import tqdm
 
 from lio_jax.ablation.cluster import at_scheduler, on_this_machine
-from lio_jax.ablation.comparison import as_text, compare
 from lio_jax.ablation.execute import execute
 from lio_jax.ablation.perform import perform
+from lio_jax.ablation.ranking import as_text, compare
 from lio_jax.ablation.report import write_report
 from lio_jax.ablation.sources import Source
 from lio_jax.ablation.spec import Spec, load_spec

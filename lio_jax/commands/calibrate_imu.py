@@ -13,10 +13,8 @@ from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.core.files import atomic_path
 from lio_jax.core.settings import settings_from_yaml
-from lio_jax.data.imu_checks import GAP_FACTOR, cleaned
-from lio_jax.data.imu_plausibility import first_motion
-from lio_jax.data.imu_units import STANDARD_GRAVITY
-from lio_jax.data.open import open_sequence
+from lio_jax.data.detect import open_sequence
+from lio_jax.data.imu_checks import GAP_FACTOR, STANDARD_GRAVITY, cleaned, first_motion
 from lio_jax.data.sequence import ImuData
 from lio_jax.imu.allan import NoiseFit, allan_deviation, averaging_factors, fit_noise
 
@@ -78,7 +76,7 @@ def calibrate_imu(data: Path, out: Path, plot: Path | None, skip: float) -> None
             )
     print(f"{out}: written; use it with --recipe {out}")
     if plot is not None:
-        from lio_jax.viz.allan_plot import plot_allan
+        from lio_jax.viz.plot import plot_allan
 
         plot_allan(plot, {f"{name} [{unit}]": noises[key] for name, key, unit in _SENSORS}, str(data))
         print(f"{plot}: drawn")

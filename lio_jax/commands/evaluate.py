@@ -3,8 +3,7 @@
 import json
 from pathlib import Path
 
-from lio_jax.evaluation.evaluate import evaluate_files
-from lio_jax.evaluation.report import format_evaluation
+from lio_jax.evaluation.evaluate import evaluate_files, format_evaluation
 
 
 def evaluate(estimate: Path, reference: Path, as_json: bool) -> None:

@@ -13,11 +13,10 @@ from lio_jax.commands.runtime import say
 from lio_jax.commands.sim import truth_beside
 from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError, UsageError
-from lio_jax.data.bag_storage import FORMAT_OF_ENDING, BagFormat
-from lio_jax.data.bag_writer import write_bag
+from lio_jax.data.bag_writer import FORMAT_OF_ENDING, BagFormat, write_bag
+from lio_jax.data.detect import open_sequence
 from lio_jax.data.kitti_writer import write_kitti
 from lio_jax.data.native_writer import write_native
-from lio_jax.data.open import open_sequence
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.data.trajectory import write_tum
 from lio_jax.data.whole_output import written_whole

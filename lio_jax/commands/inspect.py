@@ -7,7 +7,7 @@ from lio_jax.commands.runtime import say
 from lio_jax.core.errors import UsageError
 from lio_jax.core.files import atomic_path
 from lio_jax.core.settings import Settings, with_overrides
-from lio_jax.data.open import open_sequence
+from lio_jax.data.detect import open_sequence
 from lio_jax.inspection import format_inspection, inspect_sequence, settings_text
 
 

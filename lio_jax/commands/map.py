@@ -11,9 +11,8 @@ from tqdm import tqdm
 from lio_jax.commands.runtime import say
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.data.whole_output import written_whole
-from lio_jax.run.cloud_file import check_ending, read_cloud
-from lio_jax.run.keyframe_store import FOLDER, Part, read_keyframes
-from lio_jax.run.map_tiles import MapTiles
+from lio_jax.run.keyframes import FOLDER, Part, read_keyframes
+from lio_jax.run.map_file import MapTiles, check_ending, read_cloud
 
 _FINEST = 1e-3
 _AT_ONCE = 1_000_000

@@ -10,13 +10,12 @@ import numpy as np
 
 from lio_jax.commands.runtime import say
 from lio_jax.core.errors import LioJaxError, UsageError
-from lio_jax.loops.chordal import chordal_poses
-from lio_jax.loops.g2o import write_graph
-from lio_jax.loops.g2o_reader import G2oFile, read_g2o
-from lio_jax.loops.graduated import Robust
-from lio_jax.loops.graph import LOOP, Solution
-from lio_jax.loops.pose_graph import compile_for, solve
-from lio_jax.loops.structure import structure_of
+from lio_jax.pose_graph.chordal import chordal_poses
+from lio_jax.pose_graph.g2o import G2oFile, read_g2o, write_graph
+from lio_jax.pose_graph.graduated import Robust
+from lio_jax.pose_graph.graph import LOOP, Solution
+from lio_jax.pose_graph.pose_graph import compile_for, solve
+from lio_jax.pose_graph.structure import structure_of
 
 _NAMED = 5
 """So many distrusted edges are named."""

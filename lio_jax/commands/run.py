@@ -1,4 +1,4 @@
-"""``lio-jax run``: estimate a recording's trajectory and map, compare with truth, draw."""
+"""``--params-from``: settings from a parameter file of LIO-SAM or FAST-LIO2, and what became of its keys."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -7,21 +7,86 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from lio_jax.commands.params_from import beneath_recipe, mapping_table
 from lio_jax.commands.runtime import say
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.core.files import atomic_path
 from lio_jax.core.settings import Settings, load_settings, recipe_settings, with_overrides
-from lio_jax.data.foreign_settings import load_foreign_settings
-from lio_jax.data.open import open_sequence
+from lio_jax.data.detect import open_sequence
+from lio_jax.data.foreign_settings import ForeignKey, ForeignSettings, load_foreign_settings
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory, write_tum
 from lio_jax.recipes import recipe_named
 from lio_jax.run.folder import run_folder, write_json
 from lio_jax.run.run import Observer, RunResult, check_start, run_sequence, settings_for
-from lio_jax.viz.correction_record import read_correction
 from lio_jax.viz.recording import Recording
+from lio_jax.viz.run_record import read_correction
 from lio_jax.viz.run_recording import RecordingObserver
+
+
+def beneath_recipe(foreign: ForeignSettings, recipe: str | None, is_file: bool) -> Settings:
+    """Return a recipe's settings with another system's on top, and a settings file's on top of those.
+
+    Args:
+        foreign: the other system's.
+        recipe: name or settings file; None: the recipe that stands for the system. So does a file that names
+            none.
+        is_file: whether ``recipe`` is a file.
+
+    Raises:
+        UsageError: a file is unreadable, or holds an unknown key or an impossible value.
+    """
+    if not is_file:
+        return foreign.applied_to(recipe_settings(recipe or foreign.system.recipe))
+    file = Path(str(recipe))
+    named = load_settings(file, recipe_settings(foreign.system.recipe)).recipe
+    return load_settings(file, foreign.applied_to(recipe_settings(named)))
+
+
+def mapping_table(foreign: ForeignSettings, settings: Settings) -> str:
+    """Write each key of the file with what became of it in a run's settings."""
+    system, recipe = foreign.system, settings.recipe
+    taken = foreign.taken(recipe)
+    left = [entry for entry in foreign.keys if entry not in taken]
+    width = max(len(entry.key) for entry in foreign.keys)
+    lines = [f"{foreign.source}: {system.name}'s parameters, recipe {recipe}"]
+    for entry in taken:
+        lines.append(
+            f"  {entry.key:{width}}  {_short(entry.value)} -> {_ours(entry, settings)}{_said(entry.word)}"
+        )
+    if left:
+        lines.append("not taken:")
+    for entry in left:
+        why = f"of {system.name}'s method, not taken by the recipe {recipe}" if entry.settings else entry.word
+        lines.append(f"  {entry.key:{width}}  {_short(entry.value)}{_said(why)}")
+    return "\n".join(lines)
+
+
+def _ours(entry: ForeignKey, settings: Settings) -> str:
+    words = []
+    for path, value in entry.settings.items():
+        kind, section, name = path.split(".")
+        final = settings.as_dict()[kind][section][name]
+        replaced = f" (replaced: {_short(final)})" if final != _as_held(value, final) else ""
+        words.append(f"{path}={_short(value)}{replaced}")
+    return ", ".join(words)
+
+
+def _as_held(value: Any, final: Any) -> Any:
+    if isinstance(final, str):
+        return value or ""
+    return float(value) if isinstance(final, float) else value
+
+
+def _said(word: str) -> str:
+    return f"  ({word})" if word else ""
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return f"[{','.join(_short(item) for item in value)}]"
+    return str(value)
 
 
 def resolve_settings(
@@ -186,8 +251,7 @@ def _finish(result: RunResult, truth: Trajectory | None, settings: Settings, out
     text = ""
     if truth is not None:
         from lio_jax.evaluation.association import match_by_time
-        from lio_jax.evaluation.evaluate import evaluate
-        from lio_jax.evaluation.report import format_evaluation
+        from lio_jax.evaluation.evaluate import evaluate, format_evaluation
 
         try:
             evaluation = evaluate(result.trajectory, truth)

@@ -17,8 +17,7 @@ from tqdm import tqdm
 
 from lio_jax.commands.sim_options import ErrorOptions, Format, MotionOptions, SensorOptions
 from lio_jax.core.errors import UsageError
-from lio_jax.data.bag_storage import FORMAT_OF_ENDING, BagFormat, check_ending
-from lio_jax.data.bag_writer import write_bag
+from lio_jax.data.bag_writer import FORMAT_OF_ENDING, BagFormat, check_ending, write_bag
 from lio_jax.data.native_writer import write_native
 from lio_jax.data.sequence import LidarScan
 from lio_jax.data.trajectory import Trajectory, write_tum

@@ -15,12 +15,12 @@ from lio_jax.commands.runtime import say
 from lio_jax.core.errors import UsageError
 from lio_jax.core.files import atomic_path
 from lio_jax.core.settings import Settings
-from lio_jax.data.open import open_sequence
+from lio_jax.data.detect import open_sequence
 from lio_jax.run.run import settings_for
 from lio_jax.tuning.loss import Loss
-from lio_jax.tuning.named_objectives import Named, objective_named
+from lio_jax.tuning.objectives import Named, objective_named
 from lio_jax.tuning.optimise import Bounds
-from lio_jax.tuning.parameters import Free, free_parameters
+from lio_jax.tuning.parameters import ParameterVector, free_parameters
 from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.session import HISTORY, Iterate, Session
 from lio_jax.tuning.values import StreamingValues
@@ -145,7 +145,7 @@ def _recordings(
     return settings, recordings
 
 
-def _bounds(free: Free, first: np.ndarray) -> Bounds:
+def _bounds(free: ParameterVector, first: np.ndarray) -> Bounds:
     reach = {"rotation": TURN, "translation": SHIFT, "time_offset": LAG}
     width = np.array([reach.get(name.split(".")[1], math.log(FACTOR)) for name in free.names])
     upper = first + width
@@ -174,7 +174,7 @@ def _interruptible(session: Session, out: Path) -> Iterator[None]:
         say(f"interrupted: {len(session.history)} evaluations are kept; the same command goes on from there.")
 
 
-def _report(free: Free, iterate: Iterate) -> None:
+def _report(free: ParameterVector, iterate: Iterate) -> None:
     values = "  ".join(
         f"{name.split('.', 1)[1]} {value:.4g}" for name, value in _shown(free, iterate).items()
     )
@@ -187,7 +187,7 @@ def _report(free: Free, iterate: Iterate) -> None:
         )
 
 
-def _shown(free: Free, iterate: Iterate) -> dict[str, float]:
+def _shown(free: ParameterVector, iterate: Iterate) -> dict[str, float]:
     """Return the components in their own units: exp of those on a log scale."""
     return {
         name: value if name.startswith("extrinsics.") else math.exp(value)
@@ -195,7 +195,7 @@ def _shown(free: Free, iterate: Iterate) -> dict[str, float]:
     }
 
 
-def _interval(free: Free, iterate: Iterate) -> dict[str, tuple[float, float]]:
+def _interval(free: ParameterVector, iterate: Iterate) -> dict[str, tuple[float, float]]:
     """Return each component's 95 % interval where it is known."""
     if iterate.sigma is None:
         return {}
@@ -207,7 +207,7 @@ def _interval(free: Free, iterate: Iterate) -> dict[str, tuple[float, float]]:
     return intervals
 
 
-def _write(out: Path, settings: Settings, free: Free, session: Session) -> None:
+def _write(out: Path, settings: Settings, free: ParameterVector, session: Session) -> None:
     best = session.best
     tree: dict = {"recipe": settings.recipe, "params": {}}
     for path, value in free.overrides(np.asarray(best.x)).items():
@@ -215,7 +215,7 @@ def _write(out: Path, settings: Settings, free: Free, session: Session) -> None:
         tree["params"].setdefault(section, {})[name] = value
     with atomic_path(out / "tuned.yaml") as aside:
         aside.write_text(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None))
-    from lio_jax.viz.tuning_plot import plot_tuning
+    from lio_jax.viz.plot import plot_tuning
 
     shown = [_shown(free, iterate) for iterate in session.history]
     losses = {"training": np.array([iterate.value for iterate in session.history])}
@@ -225,7 +225,7 @@ def _write(out: Path, settings: Settings, free: Free, session: Session) -> None:
     plot_tuning(out / "tuning.png", losses, parameters, _interval(free, best), session.history.index(best))
 
 
-def _table(free: Free, session: Session) -> str:
+def _table(free: ParameterVector, session: Session) -> str:
     first, best = session.history[0], session.best
     before, after, intervals = _shown(free, first), _shown(free, best), _interval(free, best)
     lines = [f"{'parameter':42s} {'before':>11s} {'after':>11s}   95 % interval"]

@@ -10,7 +10,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from lio_jax.core.rotation import rotation_matrix
+from lio_jax.core.geometry import rotation_matrix
 from lio_jax.core.types import NavState
 
 DOF = 24
@@ -35,7 +35,7 @@ EXTRINSIC_TRANSLATION = slice(20, 23)
 TIME_OFFSET = slice(23, 24)
 """s."""
 LAG = slice(24, 30)
-"""Behind the state's own error in :class:`Swept`: rotation (rad) and position (m), IMU frame."""
+"""Behind the state's own error in :class:`SweptState`: rotation (rad) and position (m), IMU frame."""
 
 
 def retract(nav: NavState, error: Float[Array, "24"]) -> NavState:
@@ -107,14 +107,14 @@ def _turn_between(start: Float[Array, "3"], end: Float[Array, "3"]) -> Float[Arr
     return jnp.where(tiny, normal / jnp.sum(start**2), normal * angle / sine)
 
 
-class Uncertain(eqx.Module):
+class NavEstimate(eqx.Module):
     """A navigation state and the covariance of its error."""
 
     nav: NavState
     covariance: Float[Array, "24 24"]
 
 
-class Swept(eqx.Module):
+class SweptState(eqx.Module):
     """A navigation state at a sweep's end, and how its pose's error there differs from the sweep's mean."""
 
     nav: NavState
@@ -122,10 +122,10 @@ class Swept(eqx.Module):
     """Of the error, and of what the pose's error is ahead of its mean over the sweep's points (``LAG``)."""
 
     @staticmethod
-    def at_once(state: Uncertain) -> "Swept":
+    def at_once(state: NavEstimate) -> "SweptState":
         """Return a state that is seen at one instant."""
-        return Swept(state.nav, jnp.pad(state.covariance, (0, LAG.stop - LAG.start)))
+        return SweptState(state.nav, jnp.pad(state.covariance, (0, LAG.stop - LAG.start)))
 
-    def at_end(self) -> Uncertain:
+    def at_end(self) -> NavEstimate:
         """Return the state at the sweep's end alone."""
-        return Uncertain(self.nav, self.covariance[:DOF, :DOF])
+        return NavEstimate(self.nav, self.covariance[:DOF, :DOF])

@@ -1,12 +1,34 @@
-"""Closed forms on 3-vectors and symmetric 3x3 matrices, written for large batches.
+"""Rotation matrices, 3 x 3 symmetric eigenproblems in closed form, and matrices put together from blocks."""
 
-A symmetric matrix is given as its diagonal (xx, yy, zz) and its off-diagonal (xy, xz, yz).
-"""
-
+import jax
 import jax.numpy as jnp
+import jaxlie
+import numpy as np
 from jaxtyping import Array, Float
 
-from lio_jax.core.materialise import materialised
+from lio_jax.core.xla import computed_once
+
+_ENTRY = np.array([[0, 2, 1], [2, 0, 0], [1, 0, 0]], np.int32)
+_SIGN = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]], np.int32)
+
+
+def skew(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
+    """Return the matrix whose product with w is ``vector`` x w."""
+    return jnp.take(vector, _ENTRY, axis=-1, mode="clip") * _SIGN
+
+
+@jax.jit
+def rotation_matrix(rotation: jaxlie.SO3) -> Float[Array, "*b 3 3"]:
+    """Return the matrix of a quaternion (w, v), whatever its length.
+
+    ``R = (2 w^2 / n - 1) I + 2 / n (v v' + w V)`` with V the cross product with v and n = w^2 + v'v.
+    """
+    wxyz = rotation.wxyz
+    twice = (2 / jnp.sum(wxyz**2, -1))[..., None, None]
+    w, v = wxyz[..., :1, None], wxyz[..., 1:]
+    return (twice * w**2 - 1) * np.eye(3, dtype=wxyz.dtype) + twice * (
+        v[..., :, None] * v[..., None, :] + w * skew(v)
+    )
 
 
 def eigenvalues_and_normal3(
@@ -35,7 +57,7 @@ def eigenvalues_and_normal3(
     apart = jnp.where(thin, 2.0, -2.0) * jnp.cos(angle)
 
     bx, by, bz = ax - apart, ay - apart, az - apart
-    axis = materialised(
+    axis = computed_once(
         _longest(
             jnp.stack([xy * yz - xz * by, xz * xy - bx * yz, bx * by - xy**2], -1),
             jnp.stack([xy * bz - xz * yz, xz**2 - bx * bz, bx * yz - xy * xz], -1),
@@ -83,3 +105,22 @@ def _longest(*candidates: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
     zero = length <= jnp.finfo(best.dtype).tiny
     up = jnp.array([0, 0, 1], best.dtype)
     return jnp.where(zero[..., None], up, best / jnp.sqrt(jnp.where(zero, 1, length))[..., None])
+
+
+def from_blocks(
+    shape: tuple[int, int], *blocks: tuple[slice, slice, Float[Array, "r c"]]
+) -> Float[Array, "n m"]:
+    """Return the matrix that is zero but for the given blocks; those that overlap add up.
+
+    All of it is one kernel, where setting block after block compiles a kernel for each.
+
+    Args:
+        shape: of the matrix.
+        blocks: rows, columns and what stands there; all of one dtype.
+    """
+    padded = []
+    for rows, columns, block in blocks:
+        places = [place.indices(size)[:2] for place, size in zip((rows, columns), shape, strict=True)]
+        margins = [(start, size - stop, 0) for (start, stop), size in zip(places, shape, strict=True)]
+        padded.append(jax.lax.pad(block, jnp.zeros((), block.dtype), margins))
+    return sum(padded[1:], padded[0])

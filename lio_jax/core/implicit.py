@@ -127,7 +127,7 @@ def _felt(problem: Problem, root: Array, inputs: Any, probed_along: Callable[[Ar
     return felt
 
 
-def known(value: _Value, function: Callable[..., _Value], *inputs: Any) -> _Value:
+def with_derivative_of(value: _Value, function: Callable[..., _Value], *inputs: Any) -> _Value:
     """Return ``value`` with the derivative of ``function(*inputs)``, which would compute the same.
 
     For a result that is at hand already, as part of a larger one whose other parts need no derivative.

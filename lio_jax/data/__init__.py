@@ -1,7 +1,7 @@
 """Recordings: one protocol, one function that opens any of them."""
 
+from lio_jax.data.detect import open_sequence
 from lio_jax.data.native_writer import write_native
-from lio_jax.data.open import open_sequence
 from lio_jax.data.prefetch import prefetched
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Sequence, SequenceInfo
 from lio_jax.data.trajectory import Trajectory

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.timestamps import ns_to_seconds
-from lio_jax.data import livox
-from lio_jax.data.bag_topics import Topic
-from lio_jax.data.beam_layout import check_beams
+from lio_jax.data import pointcloud2
+from lio_jax.data.bag_files import Topic
 from lio_jax.data.point_time import PointTiming, TimeSample, recognise_point_time, scan_period, stamp_end
-from lio_jax.data.pointcloud2 import decode_pointcloud2
-from lio_jax.data.raw_cloud import RawCloud
-from lio_jax.data.reconstruct import azimuth_time, guess_beams, ring_from_elevation
+from lio_jax.data.pointcloud2 import RawCloud, decode_pointcloud2
+from lio_jax.data.reconstruct import azimuth_time, check_beams, guess_beams, ring_from_elevation
 from lio_jax.data.sequence import LidarScan
 
 if TYPE_CHECKING:
@@ -32,8 +30,8 @@ def decode_cloud(reader: "AnyReader", topic: Topic, raw: bytes, time_field: str,
         LioJaxError: the topic's layout cannot be used.
         ValueError: this one message is damaged.
     """
-    if topic.type in livox.TYPES:
-        return livox.decode_custom_msg(raw, reader.is2)
+    if topic.type in pointcloud2.LIVOX_TYPES:
+        return pointcloud2.decode_custom_msg(raw, reader.is2)
     try:
         message: Any = reader.deserialize(raw, topic.type)
     # The generated decoders raise struct, index, unicode or their own errors on damaged bytes.

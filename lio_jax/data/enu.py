@@ -1,7 +1,27 @@
-"""Geodetic coordinates to a local east-north-up frame, through earth-centred coordinates (WGS 84)."""
+"""Positions on the earth as local east, north and up."""
 
 import numpy as np
 from numpy.typing import NDArray
+
+MERCATOR_RADIUS = 6_378_137.0
+"""Earth radius of the devkit's convertOxtsToPose, m."""
+
+
+def mercator_positions(geodetic: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (n, 3) east, north, up in m by the devkit's Mercator projection.
+
+    x = s r pi lon / 180, y = s r ln tan(pi (90 + lat) / 360), z = alt, with s = cos(pi lat_0 / 180) of the
+    first fix; not relative to any origin.
+
+    Args:
+        geodetic: (n, 3) latitude deg, longitude deg, altitude m.
+    """
+    latitude, longitude = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
+    radius = np.cos(latitude[0]) * MERCATOR_RADIUS
+    return np.stack(
+        [radius * longitude, radius * np.log(np.tan(np.pi / 4 + latitude / 2)), geodetic[:, 2]], axis=1
+    )
+
 
 _SEMI_MAJOR = 6_378_137.0
 _FLATTENING = 1.0 / 298.257223563

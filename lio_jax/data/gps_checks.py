@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data.order import ascending
 from lio_jax.data.sequence import GpsData
+from lio_jax.data.time_order import ascending
 
 _UNSTATED_SIGMA = (5.0, 5.0, 10.0)
 """m, east north up: of a plain receiver, where the recording states no covariance."""

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.timestamps import seconds_to_ns
-from lio_jax.data.order import Stamped, ascending, in_time_order
 from lio_jax.data.reconstruct import KITTI_START_AZIMUTH, azimuth_time
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
+from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo, WarningLog
+from lio_jax.data.time_order import Stamped, ascending, in_time_order
 from lio_jax.data.trajectory import Trajectory, read_kitti_poses
 from lio_jax.data.velodyne_file import (
     check_sizes,
@@ -25,7 +25,6 @@ from lio_jax.data.velodyne_file import (
     numbered_files,
     read_returns,
 )
-from lio_jax.data.warning_log import WarningLog
 
 
 class KittiSequence:

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data.order import Stamped, in_time_order
-from lio_jax.data.returns import valid_returns
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
+from lio_jax.data.pointcloud2 import valid_returns
+from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo, WarningLog
+from lio_jax.data.time_order import Stamped, in_time_order
 from lio_jax.data.trajectory import Trajectory, read_tum
 from lio_jax.data.velodyne_file import listed, missing_numbers, numbered_files
-from lio_jax.data.warning_log import WarningLog
 
 FORMAT_VERSION = 1
 """Version written to and accepted from meta.yaml."""

@@ -1,14 +1,158 @@
-"""Decode sensor_msgs/PointCloud2 with any field layout."""
+"""Points of PointCloud2 and Livox messages as arrays."""
 
+import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data.livox import keep_by_tag
-from lio_jax.data.raw_cloud import RawCloud, assemble
+from lio_jax.data.bag_files import cdr_aligned, read_header
+
+
+def valid_returns(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Tell for each point (n, 3 or more; x, y, z first) whether x, y, z are finite and not all zero, (n,)."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        squared = points[:, 0] ** 2 + points[:, 1] ** 2 + points[:, 2] ** 2
+    return np.isfinite(squared) & (squared > 0)
+
+
+@dataclass(frozen=True)
+class RawCloud:
+    """The real returns of one message, times still in the sensor's own ticks."""
+
+    stamp_ns: int
+    """Header stamp, ns."""
+    points: NDArray[np.float32]
+    """(n, 3) m, finite and not all zero."""
+    intensity: NDArray[np.float32]
+    """(n,) 0 where the message holds none."""
+    ring: NDArray[np.int32] | None
+    """(n,) beam index."""
+    ring_source: str
+    """Name of the ring field; "rows" where an organised cloud's rows stand for it; "" where there is none."""
+    time: NDArray[Any] | None
+    """(n,) ticks."""
+    time_field: str
+    """Name of the time field, "" where there is none."""
+    time_range: tuple[float, float] | tuple[int, int] | None
+    """Least and greatest tick of the message, firings without a return included."""
+    dropped: int = 0
+    """Number of recorded points that are no returns."""
+
+
+def assemble(
+    stamp_ns: int,
+    xyz: NDArray[np.float32],
+    intensity: NDArray[Any] | None,
+    ring: NDArray[Any] | None,
+    ring_source: str,
+    time: NDArray[Any] | None,
+    time_field: str,
+    keep: NDArray[np.bool_] | None = None,
+) -> RawCloud:
+    """Drop what is no return (NaN, infinite, all zero, ``keep`` false, no finite time) and pack the rest.
+
+    Args:
+        xyz: (3, n) m, one row a coordinate.
+        intensity, ring, time, keep: (n,) or None.
+    """
+    valid = valid_returns(xyz.T)
+    if keep is not None:
+        valid &= keep
+    if time is not None and time.dtype.kind == "f":
+        valid &= np.isfinite(time)
+    if valid.all():
+        chosen: Any = slice(None)
+    else:
+        chosen = np.flatnonzero(valid)
+    points = np.ascontiguousarray(xyz[:, chosen].T)
+    return RawCloud(
+        stamp_ns,
+        points,
+        np.zeros(len(points), np.float32)
+        if intensity is None
+        else intensity[chosen].astype(np.float32, copy=False),
+        None if ring is None else ring[chosen].astype(np.int32, copy=False),
+        ring_source,
+        None if time is None else time[chosen],
+        time_field,
+        None if time is None else _time_range(time, valid),
+        len(valid) - len(points),
+    )
+
+
+def _time_range(time: NDArray[Any], valid: NDArray[np.bool_]) -> tuple[float, float] | tuple[int, int] | None:
+    """Take firings without a return into account, unless their time was zeroed together with their point."""
+    counted = time[valid | (np.isfinite(time) & (time != 0))]
+    if counted.size == 0:
+        return None
+    return counted.min().item(), counted.max().item()
+
+
+LIVOX_TYPES = frozenset(
+    f"{package}/msg/CustomMsg" for package in ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
+)
+
+_POINT_FIELDS = ("offset_time", "x", "y", "z", "reflectivity", "tag", "line")
+_POINT_FORMATS = ("u4", "f4", "f4", "f4", "u1", "u1", "u1")
+_POINT_BYTES = 19
+
+
+def keep_by_tag(tag: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Keep the points whose return-number bits mark a single or a first return, as FAST-LIO2 does.
+
+    Source: FAST-LIO2's Livox preprocessing, ``(tag & 0x30) in {0x00, 0x10}``.
+    """
+    bits = tag & np.uint8(0x30)
+    return (bits == 0x10) | (bits == 0x00)
+
+
+def custom_msg_field_names() -> tuple[str, ...]:
+    """Return name and type of a CustomMsg's point, such as "x f4"."""
+    return tuple(f"{name} {form}" for name, form in zip(_POINT_FIELDS, _POINT_FORMATS, strict=True))
+
+
+def decode_custom_msg(raw: bytes, ros2: bool) -> RawCloud:
+    """Decode a serialised CustomMsg of any Livox driver; times are uint32 ns from the header stamp.
+
+    The bytes are read directly: the generic decoder would make one Python object a point.
+
+    Raises:
+        ValueError: the message is shorter than it says.
+    """
+    header = read_header(raw, ros2)
+    body = cdr_aligned(header.body, 8) if ros2 else header.body
+    # uint64 timebase, uint32 point_num, uint8 lidar_id, uint8[3] rsvd, then the points behind their number.
+    try:
+        (count,) = struct.unpack_from(f"{header.order}I", raw, body + 16)
+    except struct.error:
+        raise ValueError(f"a message of {len(raw)} bytes holds no Livox points") from None
+    stride = _POINT_BYTES + 1 if ros2 else _POINT_BYTES
+    if count and body + 20 + (count - 1) * stride + _POINT_BYTES > len(raw):
+        raise ValueError(f"{count} Livox points do not fit into {len(raw)} bytes")
+    dtype = np.dtype(
+        [(name, header.order + form) for name, form in zip(_POINT_FIELDS, _POINT_FORMATS, strict=True)]
+    )
+    points: NDArray[Any] = np.empty(0, dtype)
+    if count:
+        points = np.ndarray((count,), dtype, raw, offset=body + 20, strides=(stride,))
+    xyz = np.empty((3, count), np.float32)
+    for row, axis in zip(xyz, "xyz", strict=True):
+        row[:] = points[axis]
+    return assemble(
+        header.stamp_ns,
+        xyz,
+        points["reflectivity"],
+        points["line"],
+        "line",
+        points["offset_time"].astype(np.uint32),
+        "offset_time",
+        keep_by_tag(points["tag"]),
+    )
+
 
 TYPE = "sensor_msgs/msg/PointCloud2"
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lio_jax.data import gps_messages, imu_messages, pointcloud2, static_transforms
+from lio_jax.data import navigation_messages, pointcloud2, static_transforms
 
 POSE_TYPE = "geometry_msgs/msg/PoseStamped"
 
@@ -113,7 +113,7 @@ class RosMessages:
         return self._message(
             topic,
             stamp_ns,
-            imu_messages.TYPE,
+            navigation_messages.TYPE,
             self._header(topic, frame, stamp_ns),
             self._quaternion((0.0, 0.0, 0.0, 1.0) if orientation is None else orientation),
             stated,
@@ -133,7 +133,7 @@ class RosMessages:
         return self._message(
             topic,
             stamp_ns,
-            gps_messages.FIX_TYPE,
+            navigation_messages.FIX_TYPE,
             header,
             status,
             *geodetic.tolist(),

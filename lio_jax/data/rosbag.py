@@ -11,26 +11,33 @@ from numpy.typing import NDArray
 
 from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data import gps_messages, imu_messages, livox, pointcloud2, static_transforms
-from lio_jax.data.bag_files import bag_paths, open_bag, until_damage
+from lio_jax.data import navigation_messages, pointcloud2, static_transforms
+from lio_jax.data.bag_files import (
+    BagContents,
+    Topic,
+    bag_paths,
+    bag_topics,
+    choose_topic,
+    listed,
+    open_bag,
+    read_frame,
+    read_header,
+    until_damage,
+)
 from lio_jax.data.bag_scans import decode_cloud, recognise_scans
-from lio_jax.data.bag_topics import BagContents, Topic, bag_topics, choose_topic, listed
-from lio_jax.data.gps_messages import GpsCollector
-from lio_jax.data.imu_messages import ImuCollector
-from lio_jax.data.imu_units import accel_scale
-from lio_jax.data.order import Stamped, in_time_order
-from lio_jax.data.ros_header import read_frame, read_header
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
+from lio_jax.data.imu_checks import accel_scale
+from lio_jax.data.navigation_messages import GpsCollector, ImuCollector
+from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo, WarningLog
 from lio_jax.data.static_transforms import frame_name, gathered, transform_between
+from lio_jax.data.time_order import Stamped, in_time_order
 from lio_jax.data.trajectory import Trajectory
-from lio_jax.data.warning_log import WarningLog
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
-_LIDAR_TYPES = dict.fromkeys((pointcloud2.TYPE, *sorted(livox.TYPES)), "a point cloud")
-_IMU_TYPES = {imu_messages.TYPE: "an Imu"}
-_GPS_TYPES = {gps_messages.FIX_TYPE: "a NavSatFix", gps_messages.ODOMETRY_TYPE: "an Odometry"}
+_LIDAR_TYPES = dict.fromkeys((pointcloud2.TYPE, *sorted(pointcloud2.LIVOX_TYPES)), "a point cloud")
+_IMU_TYPES = {navigation_messages.TYPE: "an Imu"}
+_GPS_TYPES = {navigation_messages.FIX_TYPE: "a NavSatFix", navigation_messages.ODOMETRY_TYPE: "an Odometry"}
 _STATIC = (static_transforms.TOPIC, static_transforms.TYPE)
 _GPS_NAMES = ("gps", "gnss", "rtk")
 
@@ -121,8 +128,8 @@ class RosbagSequence:
         fields: tuple[str, ...] = ()
         with open_bag(self._paths) as reader:
             for _, raw in self._lidar_messages(reader):
-                if self._lidar.type in livox.TYPES:
-                    fields = livox.field_names()
+                if self._lidar.type in pointcloud2.LIVOX_TYPES:
+                    fields = pointcloud2.custom_msg_field_names()
                 else:
                     # a damaged message was reported where it is decoded
                     with suppress(Exception):
@@ -219,8 +226,8 @@ class RosbagSequence:
         """Take an Odometry as GPS unasked only if its name says so: most are some estimator's output."""
         if self._config.gps_topic:
             return self._choose("gps_topic", self._config.gps_topic, topics, _GPS_TYPES)
-        fixes = tuple(topic for topic in topics if topic.type == gps_messages.FIX_TYPE)
-        odometry = tuple(topic for topic in topics if topic.type == gps_messages.ODOMETRY_TYPE)
+        fixes = tuple(topic for topic in topics if topic.type == navigation_messages.FIX_TYPE)
+        odometry = tuple(topic for topic in topics if topic.type == navigation_messages.ODOMETRY_TYPE)
         named = tuple(topic for topic in odometry if any(word in topic.name.lower() for word in _GPS_NAMES))
         if odometry and not (fixes or named):
             self._notes.append(

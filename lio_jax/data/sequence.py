@@ -1,8 +1,4 @@
-"""What every recording looks like to the rest of the package, on the host, in numpy.
-
-A reader is a small class with the methods of :class:`Sequence`; ``lio_jax.data.open_sequence`` picks one from
-the path. Scans are streamed one by one; inertial, GPS and truth samples are small and come as whole arrays.
-"""
+"""What a recording is: one protocol for all formats."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -12,6 +8,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.data.trajectory import Trajectory
+
+
+class WarningLog:
+    """Collect sentences in the order they first came up."""
+
+    def __init__(self) -> None:
+        self._sentences: dict[str, None] = {}
+
+    def add(self, sentence: str) -> None:
+        """Remember ``sentence`` unless it was said before."""
+        self._sentences[sentence] = None
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """All sentences so far; safe to ask while another thread decodes."""
+        return tuple(self._sentences.copy())
 
 
 @dataclass(frozen=True)

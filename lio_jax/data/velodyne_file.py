@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lio_jax.data.pointcloud2 import valid_returns
 from lio_jax.data.reconstruct import ring_from_azimuth_wraps, ring_from_elevation
-from lio_jax.data.returns import valid_returns
 
 _BYTES_PER_POINT = 16
 _HDL64_BEAMS = 64

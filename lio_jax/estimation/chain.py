@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.block_tridiagonal import BlockTridiagonal
+from lio_jax.estimation.block_tridiagonal import BlockTridiagonal
 from lio_jax.estimation.imu_factor import imu_information, imu_quadratic
 from lio_jax.estimation.marginal_prior import Prior
 from lio_jax.estimation.motion_state import DOF, POSE_DOF, MotionState

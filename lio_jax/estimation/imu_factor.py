@@ -6,7 +6,7 @@ import jaxlie
 from jaxtyping import Array, Float
 
 from lio_jax.core.error_state import POSITION, ROTATION, VELOCITY
-from lio_jax.core.rotation import rotation_matrix, skew
+from lio_jax.core.geometry import rotation_matrix, skew
 from lio_jax.core.types import NavState
 from lio_jax.estimation.motion_state import MotionState
 from lio_jax.estimation.pose_logarithm import right_jacobian

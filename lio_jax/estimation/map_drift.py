@@ -16,9 +16,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int32
 
-from lio_jax.core.blocks import from_blocks
 from lio_jax.core.error_state import DOF, POSITION, ROTATION, VELOCITY
-from lio_jax.core.rotation import rotation_matrix, skew
+from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
 from lio_jax.core.types import NavState
 
 _POSE = slice(ROTATION.start, POSITION.stop)

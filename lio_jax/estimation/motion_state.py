@@ -5,9 +5,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from lio_jax.core.blocks import from_blocks
 from lio_jax.core.error_state import ACCEL_BIAS, BIASES, GYRO_BIAS, POSITION, ROTATION, VELOCITY
-from lio_jax.core.rotation import rotation_matrix
+from lio_jax.core.geometry import from_blocks, rotation_matrix
 from lio_jax.core.types import NavState
 from lio_jax.estimation.pose_logarithm import right_jacobian
 

@@ -7,7 +7,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lio_jax.core.blocks import from_blocks
 from lio_jax.core.error_state import (
     BIASES,
     DOF,
@@ -19,11 +18,12 @@ from lio_jax.core.error_state import (
     ROTATION,
     TIME_OFFSET,
     VELOCITY,
-    Swept,
-    Uncertain,
+    NavEstimate,
+    SweptState,
     retract,
     sphere_basis,
 )
+from lio_jax.core.geometry import from_blocks
 from lio_jax.core.types import NavState
 from lio_jax.estimation.iterated_filter import Measurement, Update, iterated_update
 from lio_jax.estimation.pose_measurement import lidar_pose_jacobian
@@ -35,7 +35,7 @@ class _State(NamedTuple):
 
     predicted: NavState
     error: Float[Array, "30"]
-    """As in :class:`Swept`."""
+    """As in :class:`SweptState`."""
 
     def end(self) -> NavState:
         """Return the state at the sweep's end."""
@@ -76,14 +76,14 @@ class _AtMean(eqx.Module):
         return self.measure(state.mean(), *aux)
 
 
-def predicted_pose_covariance(prior: Swept) -> Float[Array, "6 6"]:
+def predicted_pose_covariance(prior: SweptState) -> Float[Array, "6 6"]:
     """Return the covariance of the mean lidar pose over a sweep, perturbed as in the update."""
     jacobian = _unchanged(prior).jacobian()
     return jacobian @ prior.covariance @ jacobian.T
 
 
 def update_nav(
-    prior: Swept,
+    prior: SweptState,
     measure: Callable[..., Measurement],
     *,
     max_iterations: int,
@@ -108,7 +108,7 @@ def update_nav(
         first_aux: see :func:`iterated_update`; ``again`` likewise.
 
     Returns:
-        The update, with an :class:`Uncertain` of the sweep's end as its ``state``, and the state with the
+        The update, with an :class:`NavEstimate` of the sweep's end as its ``state``, and the state with the
         sweep's mean pose.
     """
     dtype = prior.covariance.dtype
@@ -130,11 +130,11 @@ def update_nav(
     found: _State = update.state
     turn = reset_jacobian(prior.nav, found.error[:DOF])
     covariance = turn @ update.covariance[:DOF, :DOF] @ turn.T
-    end = Uncertain(found.end(), (covariance + covariance.T) / 2)
+    end = NavEstimate(found.end(), (covariance + covariance.T) / 2)
     return update._replace(state=end, covariance=end.covariance), found.mean()
 
 
-def _unchanged(prior: Swept) -> _State:
+def _unchanged(prior: SweptState) -> _State:
     return _State(prior.nav, jnp.zeros(prior.covariance.shape[0], prior.covariance.dtype))
 
 

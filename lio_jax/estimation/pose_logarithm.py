@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from lio_jax.core.rotation import rotation_matrix, skew
+from lio_jax.core.geometry import rotation_matrix, skew
 from lio_jax.imu.rotation_integrals import rotation_coefficients
 
 

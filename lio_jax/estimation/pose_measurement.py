@@ -5,9 +5,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.blocks import from_blocks
 from lio_jax.core.error_state import DOF, EXTRINSIC_ROTATION, EXTRINSIC_TRANSLATION, POSITION, ROTATION
-from lio_jax.core.rotation import rotation_matrix, skew
+from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
 from lio_jax.core.types import NavState
 from lio_jax.estimation.iterated_filter import Measurement
 

@@ -9,8 +9,8 @@ import jaxlie
 from jaxtyping import Array, Float
 
 from lio_jax.estimation.chain import Chain, information_of, linearise
-from lio_jax.estimation.evidence import log_scale
 from lio_jax.estimation.imu_factor import predicted
+from lio_jax.estimation.marginal_likelihood import log_scale
 from lio_jax.estimation.marginal_prior import Prior, marginalised
 from lio_jax.estimation.motion_state import DOF, MotionState
 from lio_jax.estimation.pose_factors import PoseMeasurement, PositionMeasurement, RelativePose

@@ -1,4 +1,4 @@
-"""Compare an estimated trajectory with a reference: everything ``lio-jax eval`` reports."""
+"""Score a trajectory against another one, and say so in a table."""
 
 import dataclasses
 import math
@@ -16,9 +16,7 @@ from lio_jax.evaluation.kitti_segments import SegmentErrors, kitti_errors, kitti
 from lio_jax.evaluation.load import load_trajectory
 from lio_jax.evaluation.trajectory_error import PoseError, absolute_error, relative_error
 
-# Directions of travel further apart than this are those of two sensors rather than an error.
-_BODY_AXES_RAD = 0.3
-_TRAVEL_FOR_DIRECTION_M = 1.0
+_LABEL_WIDTH = 30
 
 
 @dataclass(frozen=True)
@@ -144,3 +142,56 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def format_evaluation(evaluation: Evaluation) -> str:
+    """Return an aligned table with units, and the notes below it."""
+    duration = "" if evaluation.duration_s is None else f", {evaluation.duration_s:.1f} s"
+    method = {"umeyama": "least squares, no scale", "first_pose": "by the first pose"}[evaluation.alignment]
+    compared = f"{evaluation.matched} of {evaluation.poses} poses compared"
+    lines = [
+        f"{compared}, {evaluation.path_length_m:.2f} m{duration}; ATE aligned {method}",
+        "",
+        f"{'':<{_LABEL_WIDTH}}{'rmse':>11}{'mean':>11}{'max':>11}  unit",
+        *_pose_rows("ATE", evaluation.ate),
+        *_pose_rows("RPE, pose to pose", evaluation.rpe),
+    ]
+    for distance, error in evaluation.rpe_by_distance.items():
+        lines += _pose_rows(f"RPE, per {distance}", error)
+    lines += ["", f"{'drift over segments':<{_LABEL_WIDTH}}{'%':>11}{'deg/m':>11}{'segments':>11}"]
+    lines.append(_segment_row("KITTI, 100 to 800 m", evaluation.kitti))
+    lines.append(_segment_row("short run, 10 to 80 m", evaluation.kitti_short_10_80m))
+    if evaluation.notes:
+        lines += ["", *(f"note: {note}" for note in evaluation.notes)]
+    return "\n".join(lines)
+
+
+def _pose_rows(label: str, error: PoseError | None) -> list[str]:
+    if error is None:
+        return [f"{label:<{_LABEL_WIDTH}}{'-':>11}{'-':>11}{'-':>11}  too few poses"]
+    translation = _number(error.rmse) + _number(error.mean) + _number(error.max)
+    rotation = _number(error.rotation_rmse) + _number(error.rotation_mean) + _number(error.rotation_max)
+    return [
+        f"{label + ' translation':<{_LABEL_WIDTH}}{translation}  m",
+        f"{label + ' rotation':<{_LABEL_WIDTH}}{rotation}  rad",
+    ]
+
+
+def _segment_row(label: str, errors: SegmentErrors | None) -> str:
+    if errors is None:
+        return f"{label:<{_LABEL_WIDTH}}{'-':>11}{'-':>11}{'0':>11}"
+    numbers = _number(errors.translation_percent) + _number(errors.rotation_deg_per_m)
+    return f"{label:<{_LABEL_WIDTH}}{numbers}{errors.segments:>11}"
+
+
+def _number(value: float) -> str:
+    if not math.isfinite(value):
+        return f"{value:>11}"
+    if value != 0.0 and abs(value) < 1e-4:
+        return f"{value:>11.1e}"
+    return f"{value:>11.4f}"
+
+
+# Directions of travel further apart than this are those of two sensors rather than an error.
+_BODY_AXES_RAD = 0.3
+_TRAVEL_FOR_DIRECTION_M = 1.0

@@ -90,13 +90,13 @@ def _kitti_stamps(path: Path, count: int) -> NDArray[np.int64] | None:
 
 
 def _bag_suffixes() -> tuple[str, ...]:
-    from lio_jax.data.open import BAG_SUFFIXES
+    from lio_jax.data.detect import BAG_SUFFIXES
 
     return BAG_SUFFIXES
 
 
 def _recorded_truth(path: Path) -> LoadedTrajectory:
-    from lio_jax.data.open import open_sequence
+    from lio_jax.data.detect import open_sequence
 
     truth = open_sequence(path).truth()
     if truth is None or len(truth) == 0:

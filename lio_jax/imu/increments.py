@@ -12,10 +12,9 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from lio_jax.core.blocks import from_blocks
 from lio_jax.core.error_state import POSITION, ROTATION, VELOCITY
+from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
 from lio_jax.core.prefix_sum import prefix_sum
-from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.imu.rotation_integrals import integral_derivatives, rotation_exponential, rotation_integrals
 
 NAV_DOF = 9

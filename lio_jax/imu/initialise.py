@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.blocks import from_blocks
 from lio_jax.core.error_state import (
     ACCEL_BIAS,
     DOF,
@@ -17,12 +16,12 @@ from lio_jax.core.error_state import (
     ROTATION,
     TIME_OFFSET,
     VELOCITY,
-    Uncertain,
+    NavEstimate,
     sphere_basis,
 )
+from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
 from lio_jax.core.params import ImuParams, InitialParams
 from lio_jax.core.prefix_sum import running_count
-from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.core.types import ImuBatch, NavState, initial_nav_state
 
 MIN_SAMPLES = 5
@@ -47,7 +46,7 @@ _UNKNOWN_TILT = 1.0
 class RestStart(eqx.Module):
     """A first navigation state from samples that should be of a vehicle at rest."""
 
-    start: Uncertain
+    start: NavEstimate
     """At rest: levelled, biases found, velocity zero. Else: levelled roughly, biases zero, velocity open."""
     is_still: Bool[Array, ""]
     accel_scale: Float[Array, ""]
@@ -121,7 +120,7 @@ def initialise_at_rest(
         ),
     )
     return RestStart(
-        start=Uncertain(nav=nav, covariance=covariance),
+        start=NavEstimate(nav=nav, covariance=covariance),
         is_still=is_still,
         accel_scale=jnp.where(present, strength / params.gravity, 0.0),
         gyro_scatter=jnp.sqrt(gyro_scatter),

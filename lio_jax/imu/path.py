@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int32
 
-from lio_jax.core.materialise import materialised
-from lio_jax.core.rotation import rotation_matrix
+from lio_jax.core.geometry import rotation_matrix
+from lio_jax.core.xla import computed_once
 from lio_jax.imu.rotation_integrals import SERIES_LIMIT, rotation_series
 
 
@@ -127,7 +127,7 @@ def _carried(motion: _Motion, time: Float[Array, " n"], points: Float[Array, "n 
     p = _each(lambda i: x * x_axis[i] + y * y_axis[i] + z * z_axis[i] + arm[i])
     w = _each(lambda i: h * rate[i])
     # once, instead of once for each column
-    a, b, c, d = materialised(rotation_series(jnp.minimum(sum(x**2 for x in w), SERIES_LIMIT)))
+    a, b, c, d = computed_once(rotation_series(jnp.minimum(sum(x**2 for x in w), SERIES_LIMIT)))
     turned, pushed = _cross(w, p), _cross(w, force)
     twice, pushed_twice = _cross(w, turned), _cross(w, pushed)
 

@@ -9,9 +9,8 @@ from jaxtyping import Array, Bool, Float
 from lio_jax.core.error_state import POSITION, ROTATION, VELOCITY
 from lio_jax.core.params import ImuParams
 from lio_jax.core.types import NavState
-from lio_jax.imu.discretise import discretise
+from lio_jax.imu.discretise import discretise, process_noise
 from lio_jax.imu.increments import NAV_DOF, accumulate, nav_transition, sensitivity
-from lio_jax.imu.process_noise import process_noise
 from lio_jax.imu.sampling import Intervals
 
 

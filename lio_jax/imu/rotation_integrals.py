@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from lio_jax.core.rotation import skew
+from lio_jax.core.geometry import skew
 
 SERIES_LIMIT = 40.0
 """Square of the angle, rad^2, up to which the power series holds to float32's precision."""

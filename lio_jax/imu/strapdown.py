@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from lio_jax.core.blocks import from_blocks
 from lio_jax.core.error_state import (
     BIASES,
     DOF,
@@ -17,43 +16,42 @@ from lio_jax.core.error_state import (
     ROTATION,
     TIME_OFFSET,
     VELOCITY,
-    Swept,
-    Uncertain,
+    NavEstimate,
+    SweptState,
     sphere_basis,
 )
+from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
 from lio_jax.core.params import ImuParams
-from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.core.types import ImuBatch, NavState
-from lio_jax.imu.discretise import discretise
+from lio_jax.imu.discretise import discretise, process_noise
 from lio_jax.imu.increments import NAV_DOF, Increments, accumulate, nav_transition, sensitivity
 from lio_jax.imu.path import Path
-from lio_jax.imu.process_noise import process_noise
 from lio_jax.imu.sampling import Intervals, sample_intervals
-from lio_jax.imu.sweep_lag import LAG_DOF, lag_of_durations, lag_of_inputs, still_to_show
+from lio_jax.imu.sweep_mean_error import LAG_DOF, lag_of_durations, lag_of_inputs, still_to_show
 
 _LAG_POSITION = slice(LAG.start + 3, LAG.stop)
 
 
 def propagate(
-    state: Uncertain,
+    state: NavEstimate,
     imu: ImuBatch,
     params: ImuParams,
     start: Float[Array, ""],
     end: Float[Array, ""],
-) -> tuple[Uncertain, Path]:
+) -> tuple[NavEstimate, Path]:
     """Carry a state from ``start`` to ``end`` as :func:`propagate_sweep` does, without a sweep."""
     swept, path = propagate_sweep(state, imu, params, start, end, end)
     return swept.at_end(), path
 
 
 def propagate_sweep(
-    state: Uncertain,
+    state: NavEstimate,
     imu: ImuBatch,
     params: ImuParams,
     start: Float[Array, ""],
     end: Float[Array, ""],
     sweep_start: Float[Array, ""],
-) -> tuple[Swept, Path]:
+) -> tuple[SweptState, Path]:
     """Carry a state from ``start`` to ``end`` along the inertial samples, with its covariance.
 
     The samples are sampled as :func:`lio_jax.imu.sampling.sample_intervals` says, at the lidar's clock. Where
@@ -95,7 +93,7 @@ def propagate_sweep(
     noise = discretise(params, intervals.duration, intervals.gap, intervals.known)
     added = process_noise(inputs, noise, intervals.measured)
     covariance = transition @ state.covariance @ transition.T + _placed(added)
-    return Swept(moved, (covariance + covariance.T) / 2), path
+    return SweptState(moved, (covariance + covariance.T) / 2), path
 
 
 def path_along(nav: NavState, imu: ImuBatch, start: Float[Array, ""], end: Float[Array, ""]) -> Path:

@@ -6,9 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.config import DataConfig
-from lio_jax.data.imu_checks import LARGEST, cleaned, coverage
-from lio_jax.data.imu_plausibility import still_second
-from lio_jax.data.imu_units import accel_scale
+from lio_jax.data.imu_checks import LARGEST, accel_scale, cleaned, coverage, still_second
 from lio_jax.data.sequence import ImuData
 
 _G_RANGE = (0.8, 1.25)

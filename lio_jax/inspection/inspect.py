@@ -17,7 +17,7 @@ from lio_jax.inspection.requirements import missing
 from lio_jax.inspection.sampling import WINDOW_SCANS, Sampled, sampled
 from lio_jax.inspection.scans import ScanSummary
 from lio_jax.inspection.suspicions import suspicions
-from lio_jax.run.surroundings import fitted_to_surroundings
+from lio_jax.run.fitted_settings import fitted_to_surroundings
 
 _TRACKED_WINDOWS = 4
 _TRACKED_SCANS = 40

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.core.settings import Settings
 from lio_jax.data.sequence import ImuData, LidarScan
-from lio_jax.run.track import CompiledStep, Tracked, track
+from lio_jax.run.track import CompiledStep, ScanResult, track
 
 THINNED_TO = 16384
 _LEAST_TURNS = 6
@@ -95,7 +95,7 @@ def _middle_ns(scan: LidarScan) -> int:
     return scan.stamp_ns + round(scan.duration / 2 * 1e9)
 
 
-def _attitude(tracked: Tracked) -> NDArray[np.float64]:
+def _attitude(tracked: ScanResult) -> NDArray[np.float64]:
     wxyz = np.asarray(tracked.output.registration.T_world_lidar.wxyz_xyz, np.float64)[:4]
     return Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
 

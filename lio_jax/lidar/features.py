@@ -6,6 +6,10 @@
 Indices carry no gradient; the points they gather, and the means, do.
 """
 
+import dataclasses
+from collections.abc import Callable
+from typing import Any, TypeVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,9 +17,9 @@ from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.config import Config
 from lio_jax.core.errors import UsageError
-from lio_jax.core.materialise import materialised
 from lio_jax.core.params import Params
 from lio_jax.core.types import Scan
+from lio_jax.core.xla import computed_once
 from lio_jax.lidar.picking import Picks, Ring, pick, sector_bounds
 from lio_jax.lidar.range_image import RangeImage, range_image
 from lio_jax.lidar.ring_voxel_mean import mean_per_ring_and_voxel
@@ -27,6 +31,7 @@ from lio_jax.lidar.smoothness import (
     range_smoothness,
     reach,
 )
+from lio_jax.lidar.thinning import mean_per_voxel
 
 
 class FeatureCloud(eqx.Module):
@@ -151,7 +156,7 @@ def lio_sam_rings(config: Config, params: Params, scan: Scan) -> Rings:
     limits, neighbours = params.features, config.features.neighbours
     with jax.named_scope("smoothness"):
         x, y, z = xyz
-        ranges, column, mask = materialised(jnp.sqrt(x**2 + y**2 + z**2)), image.column, image.mask
+        ranges, column, mask = computed_once(jnp.sqrt(x**2 + y**2 + z**2)), image.column, image.mask
         hidden = occluded(
             ranges,
             column,
@@ -177,7 +182,7 @@ def _gathered(
             jnp.where(image.mask, values.at[image.index].get(mode="clip"), 0.0)
             for values in (*(scan.points[:, axis] for axis in range(3)), scan.time)
         )
-        x, y, z, time = materialised((x, y, z, time))
+        x, y, z, time = computed_once((x, y, z, time))
     return image, (x, y, z), time
 
 
@@ -237,3 +242,47 @@ def _surface(
             rings.xyz, rings.time, surface, spacing, config.features.surface_points
         )
     return FeatureCloud(means.points, means.time, means.ring, means.mask), means.dropped
+
+
+_Features = TypeVar("_Features")
+
+
+def in_single_precision(
+    pick: Callable[[Config, Params, Scan], _Features], config: Config, params: Params, scan: Scan
+) -> _Features:
+    """Pick features in single precision, since which ones has no derivative; return them in the scan's."""
+    dtype = scan.points.dtype
+    single = dataclasses.replace(
+        scan, points=scan.points.astype(jnp.float32), time=scan.time.astype(jnp.float32)
+    )
+    found = pick(config, params, single)
+    return jax.tree.map(_cast_to(dtype), found)
+
+
+def thinned_features(
+    corner: FeatureCloud, surface: FeatureCloud, params: Params, corners: int, surfaces: int
+) -> tuple[FeatureCloud, FeatureCloud, Int32[Array, ""]]:
+    """Return the means per voxel of the map, and how many found no room.
+
+    They are averaged before the motion is compensated and not after it, so that the groups do not depend on
+    the motion: points as near to each other as these are moved alike.
+
+    Args:
+        corner: of a scan.
+        surface: of a scan.
+        params: voxel sizes.
+        corners: capacity.
+        surfaces: capacity.
+    """
+    kinds = ((corner, params.map.corner_voxel_size, corners), (surface, params.map.voxel_size, surfaces))
+    clouds, dropped = [], jnp.int32(0)
+    for cloud, size, capacity in kinds:
+        mean = mean_per_voxel(cloud.points, cloud.mask, size.astype(jnp.float32), capacity, cloud.time)
+        assert mean.time is not None
+        clouds.append(FeatureCloud(mean.points, mean.time, jnp.zeros(capacity, jnp.int32), mean.mask))
+        dropped += mean.dropped
+    return clouds[0], clouds[1], dropped
+
+
+def _cast_to(dtype: jnp.dtype) -> Callable[[Any], Any]:
+    return lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf

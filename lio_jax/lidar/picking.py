@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float32, Int32
 
-from lio_jax.core.materialise import materialised
+from lio_jax.core.xla import computed_once
 
 _CLOSED = -1
 """Key of a point that can't be picked any more; open points have non-negative keys."""
@@ -142,7 +142,7 @@ class _Turns(eqx.Module):
         def one(turn: tuple[Array, ...]) -> tuple[Array, ...]:
             done, keys, picks, free, _ = turn
             # in memory of its own: a loop that reads what it carries is not vectorised
-            keys = materialised(keys)
+            keys = computed_once(keys)
             best = jnp.max(keys, 0)
             found = best > above
             won = jnp.max(jnp.where(keys == best, ticket, 0), 0)

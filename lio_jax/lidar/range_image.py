@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float32, Int32
 
 from lio_jax.core.config import FeaturesConfig
 from lio_jax.core.params import Params
-from lio_jax.core.running_count import counts_before
+from lio_jax.core.prefix_sum import counts_before
 from lio_jax.core.types import Scan
 
 

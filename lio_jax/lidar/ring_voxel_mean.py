@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float32, Int32
 
 from lio_jax.core.hashing import voxel_hash
-from lio_jax.core.materialise import materialised
-from lio_jax.core.running_count import counts_before
+from lio_jax.core.prefix_sum import counts_before
+from lio_jax.core.xla import computed_once
 
 
 class RingMeans(eqx.Module):
@@ -50,7 +50,7 @@ def mean_per_ring_and_voxel(
     share = jnp.minimum(capacity / jnp.sum(count, dtype=jnp.int32).astype(jnp.float32), 1.0)
     row = jnp.floor(rank * share)
     kept = leads & (jnp.floor((rank - 1) * share) < row)
-    row = materialised(jnp.where(kept, row.astype(jnp.int32), capacity).ravel())
+    row = computed_once(jnp.where(kept, row.astype(jnp.int32), capacity).ravel())
     target = row.at[first].get(mode="fill", fill_value=capacity)
     ring = jnp.broadcast_to(jnp.arange(rings, dtype=jnp.float32), mask.shape)
     terms = jnp.stack([*xyz, time, ring, jnp.ones_like(time)], -1).reshape(k * rings, 6)

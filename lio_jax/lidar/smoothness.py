@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float32, Int32, Shaped
 
-from lio_jax.core.materialise import materialised
+from lio_jax.core.xla import computed_once
 
 
 def point_smoothness(
@@ -67,7 +67,7 @@ def occluded(
     further = after_each(ranges) - ranges
     hides_before, hides_after = close & (-further > step), close & (further > step)
     edges = hides_before.astype(jnp.int8) + 2 * hides_after.astype(jnp.int8)
-    framed = materialised(_framed(edges, neighbours + 1))
+    framed = computed_once(_framed(edges, neighbours + 1))
     hidden = jnp.zeros_like(mask)
     for by in range(neighbours + 1):
         hidden |= _window(framed, by, neighbours + 1) == 1
@@ -97,7 +97,7 @@ def reach(
         connected: whether suppression passes from a point to the one after it.
         neighbours: on either side.
     """
-    passes = materialised(_framed(connected, neighbours))
+    passes = computed_once(_framed(connected, neighbours))
     before, after = jnp.zeros(connected.shape, jnp.int32), jnp.zeros(connected.shape, jnp.int32)
     for step in reversed(range(neighbours)):
         after = jnp.where(_window(passes, step, neighbours), after + 1, 0)

@@ -1,12 +1,71 @@
-"""What of a scan goes into the map, and what of that is matched."""
+"""Thin a scan: one point a voxel, or the mean of the points in it."""
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int32
+from jaxtyping import Array, Bool, Float, Float32, Int32
 
+from lio_jax.core.hashing import voxel_hash
 from lio_jax.core.params import Params
+from lio_jax.core.prefix_sum import running_count
 from lio_jax.core.types import Scan
-from lio_jax.lidar.downsample import Selection, select_per_voxel
+from lio_jax.core.xla import computed_once
+
+
+class Selection(eqx.Module):
+    """Indices into a scan, padded to a capacity."""
+
+    index: Int32[Array, " k"]
+    mask: Bool[Array, " k"]
+    dropped: Int32[Array, ""]
+    """Occupied cells that found no room in the capacity."""
+
+
+def select_per_voxel(
+    points: Float[Array, "n 3"], mask: Bool[Array, " n"], voxel_size: Float[Array, ""], capacity: int
+) -> Selection:
+    """Select at most one point of each cubic voxel, at most ``capacity`` in all.
+
+    Every point writes a scrambled copy of its index into the slot its voxel hashes to and the largest one
+    stays, so which point represents a voxel is a fixed pseudo-random choice. Two voxels that share a slot
+    lose one of them, and slots beyond the capacity are cut off; both thin the scan evenly over space, because
+    slots are hashes. Indices carry no gradient.
+
+    Args:
+        points: m, any frame.
+        mask: which rows are real.
+        voxel_size: edge length, m.
+        capacity: number of returned indices.
+    """
+    table_size = 1 << (4 * capacity - 1).bit_length()
+    voxel = jnp.floor(points / voxel_size.astype(points.dtype)).astype(jnp.int32)
+    slot = jnp.where(mask, voxel_hash(voxel) & jnp.uint32(table_size - 1), table_size).astype(jnp.int32)
+    ticket = _scramble(jnp.arange(points.shape[0], dtype=jnp.uint32)).astype(jnp.int32)
+    winner = jnp.full(table_size, -1, jnp.int32).at[slot].max(ticket, mode="drop")
+    occupied = winner >= 0
+    rank = running_count(occupied) - 1
+    target = jnp.where(occupied, rank, capacity)
+    chosen = jnp.full(capacity, -1, jnp.int32).at[target].set(winner, mode="drop")
+    found = rank[-1] + 1
+    return Selection(
+        index=jnp.where(chosen >= 0, _unscramble(chosen.astype(jnp.uint32)), 0).astype(jnp.int32),
+        mask=chosen >= 0,
+        dropped=jnp.maximum(found - capacity, 0),
+    )
+
+
+_BITS = 24
+_MASK = (1 << _BITS) - 1
+_FACTOR = 0x9E3779 | 1
+_INVERSE = pow(_FACTOR, -1, 1 << _BITS)
+
+
+def _scramble(index: Array) -> Array:
+    """Permute 0 .. 2^24 - 1 (odd multiplier modulo a power of two)."""
+    return (index * jnp.uint32(_FACTOR)) & jnp.uint32(_MASK)
+
+
+def _unscramble(ticket: Array) -> Array:
+    return (ticket * jnp.uint32(_INVERSE)) & jnp.uint32(_MASK)
 
 
 class ThinnedScan(eqx.Module):
@@ -49,3 +108,55 @@ def thinned(
     return ThinnedScan(
         points, scan.time[chosen.index], chosen.mask, matched, chosen.dropped + matched.dropped
     )
+
+
+class MeanPoints(eqx.Module):
+    """One point per occupied voxel, the real ones first."""
+
+    points: Float[Array, "k 3"]
+    """m."""
+    time: Float[Array, " k"] | None
+    """s; None where the points have none."""
+    mask: Bool[Array, " k"]
+    dropped: Int32[Array, ""]
+    """Occupied voxels that found no room in the capacity."""
+
+
+def mean_per_voxel(
+    points: Float[Array, "n 3"],
+    mask: Bool[Array, " n"],
+    voxel_size: Float32[Array, ""],
+    capacity: int,
+    time: Float[Array, " n"] | None = None,
+) -> MeanPoints:
+    """Return the mean of each cubic voxel's points, of at most ``capacity`` voxels.
+
+    Voxels are hashed into slots. Of two that share one the second is left out, and slots beyond the capacity
+    are cut off; both thin the scan evenly over space, because slots are hashes.
+
+    Args:
+        points: m, any frame.
+        mask: which rows are real.
+        voxel_size: edge length, m.
+        capacity: number of returned rows.
+        time: of the points, to be averaged with them, s.
+    """
+    table_size = 1 << (4 * capacity - 1).bit_length()
+    voxel = jnp.floor(jnp.where(mask[:, None], points, 0.0) / voxel_size).astype(jnp.int32)
+    slot = jnp.where(mask, voxel_hash(voxel) & jnp.uint32(table_size - 1), table_size).astype(jnp.int32)
+    order = jnp.arange(points.shape[0], dtype=jnp.int32)
+    last = jnp.full(table_size, -1, jnp.int32).at[slot].max(order, mode="drop")
+    rank = running_count(last >= 0) - 1
+    row, winner = (table.at[slot].get(mode="clip") for table in (rank, last))
+    x, y, z = (voxel[:, axis] == voxel[jnp.maximum(winner, 0), axis] for axis in range(3))
+    row = computed_once(jnp.where(mask & x & y & z & (row < capacity), row, capacity))
+    count = jnp.zeros(capacity, points.dtype).at[row].add(1.0, mode="drop")
+
+    def mean(values: Array) -> Array:
+        return jnp.zeros(capacity, values.dtype).at[row].add(values, mode="drop") / jnp.maximum(count, 1.0)
+
+    means = jnp.zeros((capacity, 3), points.dtype)
+    for axis in range(3):
+        means = means.at[:, axis].set(mean(points[:, axis]))
+    times = None if time is None else mean(time)
+    return MeanPoints(means, times, count > 0, jnp.maximum(rank[-1] + 1 - capacity, 0))

@@ -1,29 +1,187 @@
-"""Correct the drift of an odometry: keyframes in, one by one, and one consistent trajectory out.
-
-The block diagram of LIO-SAM's map optimisation (Shan et al., "LIO-SAM: tightly-coupled lidar inertial
-odometry via smoothing and mapping", IROS 2020, III-D and III-E): odometry, loops, GPS, pose graph.
-What becomes of a keyframe depends on those up to it alone, never on the clock.
-"""
+"""The back end: a pose graph of keyframes, loops and GPS fixes, and how it corrects the odometry."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol, runtime_checkable
 
+import equinox as eqx
+import jax
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from lio_jax.core.pose_covariance import carried
 from lio_jax.core.settings import Settings
 from lio_jax.loops.closing import held_by
-from lio_jax.loops.drift_correction import levelled_onto
-from lio_jax.loops.gps import Fix, GpsGate, Refusal
-from lio_jax.loops.gps_alignment import alignment
-from lio_jax.loops.graph import LOOP, ODOMETRY, POSITION, PRIOR
+from lio_jax.loops.gps import Fix, GpsGate, Refusal, alignment
 from lio_jax.loops.keyframe import Keyframe
-from lio_jax.loops.keyframe_graph import Edge, Solved, solved
 from lio_jax.loops.verification import Verdict
+from lio_jax.pose_graph.graduated import Robust
+from lio_jax.pose_graph.graph import (
+    LOOP,
+    ODOMETRY,
+    POSITION,
+    PRIOR,
+    PoseGraph,
+    Poses,
+    matrices_of,
+    poses_from,
+)
+from lio_jax.pose_graph.pose_graph import solve
 
 _Array = NDArray[np.float64]
+
+
+def corrected_poses(
+    stamp_ns: NDArray[np.int64],
+    T_odom_imu: _Array,
+    keyframe_stamp_ns: NDArray[np.int64],
+    keyframes_T_odom_imu: _Array,
+    keyframes_T_world_imu: _Array,
+) -> _Array:
+    """Return T_world_imu (n, 4, 4) of poses of the odometry.
+
+    A pose between two keyframes is where each of them sees it, weighed by time; one before the first or
+    behind the last is where that one sees it. Keyframes themselves get their own corrected pose.
+
+    Args:
+        stamp_ns: (n,) of the poses.
+        T_odom_imu: (n, 4, 4).
+        keyframe_stamp_ns: (k,) ascending, k > 0.
+        keyframes_T_odom_imu: (k, 4, 4).
+        keyframes_T_world_imu: (k, 4, 4) as corrected.
+    """
+    last = len(keyframe_stamp_ns) - 1
+    before = np.clip(np.searchsorted(keyframe_stamp_ns, stamp_ns, side="right") - 1, 0, last)
+    after = np.minimum(before + 1, last)
+    span = (keyframe_stamp_ns[after] - keyframe_stamp_ns[before]).astype(np.float64)
+    share = np.clip((stamp_ns - keyframe_stamp_ns[before]) / np.where(span > 0, span, 1.0), 0.0, 1.0)
+    T_world_odom = keyframes_T_world_imu @ np.linalg.inv(keyframes_T_odom_imu)
+    seen_before, seen_after = T_world_odom[before] @ T_odom_imu, T_world_odom[after] @ T_odom_imu
+    turn = Rotation.from_matrix(seen_before[:, :3, :3].transpose(0, 2, 1) @ seen_after[:, :3, :3])
+    poses = seen_before.copy()
+    part_of_turn = Rotation.from_rotvec(turn.as_rotvec() * share[:, None]).as_matrix()
+    poses[:, :3, :3] = seen_before[:, :3, :3] @ part_of_turn
+    poses[:, :3, 3] += share[:, None] * (seen_after[:, :3, 3] - seen_before[:, :3, 3])
+    return poses
+
+
+def levelled_onto(T_a_imu: _Array, T_b_imu: _Array) -> _Array:
+    """Return T_b_a, a turn about the vertical and a shift, that lays one pose of z-up frame a onto b's.
+
+    The heading agrees as far as a turn about the vertical can make it; the position agrees.
+
+    Args:
+        T_a_imu: (4, 4).
+        T_b_imu: (4, 4).
+    """
+    between = T_b_imu[:3, :3] @ T_a_imu[:3, :3].T
+    yaw = np.arctan2(between[1, 0] - between[0, 1], between[0, 0] + between[1, 1])
+    T_b_a = np.eye(4)
+    T_b_a[:3, :3] = Rotation.from_euler("z", yaw).as_matrix()
+    T_b_a[:3, 3] = T_b_imu[:3, 3] - T_b_a[:3, :3] @ T_a_imu[:3, 3]
+    return T_b_a
+
+
+_SUSPICIOUS = 1e-4
+"""An edge that lies this far out, by the chi-square distribution, has the whole graph solved robustly."""
+
+
+_SYSTEMATIC = 5.0
+"""So many sigmas the odometry may be off in the same direction, keyframe after keyframe."""
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """One measurement."""
+
+    kind: int
+    """ODOMETRY, LOOP, PRIOR or POSITION."""
+    i: int
+    j: int
+    measured: _Array
+    """(4, 4): T_i_j, or T_world_j of a prior; of a position only the translation counts."""
+    information: _Array
+    """(6, 6) of the right perturbation, rotation (rad) first; of a position in world axes."""
+    lever: _Array | None = None
+    """(3,) m, in the frame of j: the point whose position is measured; None: the origin."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The graph's poses and how far each edge is believed."""
+
+    poses: _Array
+    """(k, 4, 4) T_world_keyframe."""
+    weights: _Array
+    """(e,) 1, or below where an edge contradicts the others."""
+
+
+def solved(poses: _Array, edges: list[Edge]) -> Solved:
+    """Return the poses that agree best with the edges.
+
+    Trusting all edges first is many times quicker; only where an edge then lies improbably far off are loops
+    and positions doubted. For that the odometry counts less: its errors follow each other, and true loops,
+    which all contradict it in the same way, must not be taken for the wrong ones.
+
+    Args:
+        poses: (k, 4, 4) to begin with; the first one stays where no prior or position ties the graph.
+        edges: between them.
+    """
+    graph = graph_of(poses, edges)
+    plain = solve(graph, start="poses")
+    kind = np.array([edge.kind for edge in edges])
+    doubted = (kind == LOOP) | (kind == POSITION)
+    limit = chi2.isf(_SUSPICIOUS, np.where(kind == POSITION, 3, 6))
+    if not np.any(doubted & (2 * np.asarray(plain.edge_costs) > limit)):
+        return Solved(matrices_of(plain.poses), np.ones(len(edges)))
+    loose = [
+        replace(edge, information=edge.information / _SYSTEMATIC**2) if edge.kind == ODOMETRY else edge
+        for edge in edges
+    ]
+    weights = _robust_weights(poses, loose, doubted)
+    believed = [edge for edge, weight in zip(edges, weights, strict=True) if weight > 0.5]
+    if len(believed) == len(edges):
+        return Solved(matrices_of(plain.poses), weights)
+    return Solved(matrices_of(solve(graph_of(poses, believed), start="poses").poses), weights)
+
+
+def _robust_weights(poses: _Array, edges: list[Edge], doubted: NDArray[np.bool_]) -> _Array:
+    """Return the (e,) weights of the better one of two truncated least squares: both are local searches."""
+    begins: tuple[Literal["trusted", "given"], ...] = ("trusted", "given")
+    found = []
+    for begin in begins:
+        graph = graph_of(poses, edges)
+        if begin == "given":
+            graph = eqx.tree_at(lambda graph: graph.poses, graph, solve(graph, start="poses").poses)
+        solution = solve(graph, start="poses", robust=Robust(begin=begin))
+        costs = np.asarray(solution.edge_costs)
+        limit = chi2.ppf(Robust.confidence, np.where(np.asarray(graph.kind) == POSITION, 3, 6)) / 2
+        truncated = np.where(doubted, np.minimum(costs, limit), costs)
+        found.append((float(truncated.sum()), np.asarray(solution.weights)))
+    return min(found, key=lambda each: each[0])[1]
+
+
+def graph_of(poses: _Array, edges: list[Edge]) -> PoseGraph:
+    """Return the pose graph of (k, 4, 4) poses and the edges between them."""
+    measured = np.array([edge.measured for edge in edges]).reshape(-1, 4, 4)
+    levers = np.array([np.zeros(3) if edge.lever is None else edge.lever for edge in edges]).reshape(-1, 3)
+    return PoseGraph(
+        poses=_se3(poses),
+        i=jax.device_put(np.array([edge.i for edge in edges], np.int64)),
+        j=jax.device_put(np.array([edge.j for edge in edges], np.int64)),
+        measurement=_se3(measured),
+        information=jax.device_put(np.array([edge.information for edge in edges]).reshape(-1, 6, 6)),
+        kind=jax.device_put(np.array([edge.kind for edge in edges], np.int64)),
+        fixed=jax.device_put(np.zeros(len(poses), bool)),
+        lever=jax.device_put(levers),
+    )
+
+
+def _se3(poses: _Array) -> Poses:
+    return poses_from(poses[:, :3, :3], poses[:, :3, 3])
+
 
 _SOLVE_EVERY, _SOLVE_SHARE = 20, 0.05
 """Keyframes from one solve to the next while loops and fixes come in that agree with the poses, and as a

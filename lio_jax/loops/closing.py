@@ -9,16 +9,19 @@ from numpy.typing import NDArray
 
 from lio_jax.core.settings import Settings
 from lio_jax.loops.consistency import Consensus, consistent
-from lio_jax.loops.drift import AT_LEAST, metres_from
-from lio_jax.loops.external_pairs import Pair, keyframe_at, read_pairs
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.loops.place_descriptor import Places
 from lio_jax.loops.proposals import (
+    AT_LEAST,
+    Pair,
     Proposal,
     described_proposals,
     external_proposal,
     is_old,
+    keyframe_at,
+    metres_from,
     nearest_proposal,
+    read_pairs,
 )
 from lio_jax.loops.verification import Verdict, verify
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.loops.drift import possible_error
 from lio_jax.loops.keyframe import Keyframe
+from lio_jax.loops.proposals import possible_error
 from lio_jax.loops.verification import Verdict
 
 _SUPPORT = 2

@@ -1,15 +1,167 @@
-"""Which earlier keyframes the newest one is compared with."""
+"""Pairs of keyframes that may show the same place: by distance, by descriptor, from a file."""
 
+import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial.transform import Rotation
 
-from lio_jax.loops.drift import possible_error
+from lio_jax.core.errors import LioJaxError, UsageError
+from lio_jax.core.timestamps import seconds_to_ns
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.loops.place_descriptor import Likeness, Places
+
+_ACROSS = 1.0
+"""A closed loop is as sure as this much odometry, m."""
+
+
+class Error(NamedTuple):
+    """Largest error of a relative pose that is believed."""
+
+    position: NDArray[np.float64]
+    """m."""
+    heading: NDArray[np.float64]
+    """rad."""
+
+
+AT_LEAST = Error(np.array(1.0), np.array(0.1))
+"""What is possible however short the way: the keyframes' clouds are thinned."""
+
+
+def possible_error(metres: NDArray[np.float64] | float, limits: dict[str, Any]) -> Error:
+    """Return how wrong relative poses may be after so many metres of odometry.
+
+    Args:
+        metres: run between the two poses.
+        limits: ``params.loop`` as plain numbers.
+    """
+    run = np.asarray(metres, np.float64)
+    position = np.asarray(AT_LEAST.position + limits["drift"] * run)
+    heading = np.minimum(AT_LEAST.heading + limits["heading_drift"] * run, np.pi)
+    return Error(position, np.asarray(heading))
+
+
+def metres_from(
+    source: int, run: NDArray[np.float64], closed: Sequence[tuple[int, int]]
+) -> NDArray[np.float64]:
+    """Return the odometry between a keyframe and every other along the shortest way, (k,) m.
+
+    A way may take closed loops as short cuts: after one the drift begins anew.
+
+    Args:
+        source: number of the keyframe.
+        run: (k,) what the odometry has run up to each, m.
+        closed: pairs of keyframes that loops tie together.
+    """
+    count = len(run)
+    if not closed:
+        return np.abs(run - run[source])
+    first = np.arange(count - 1)
+    loops = np.array(closed, np.int64).reshape(-1, 2)
+    rows, columns = np.concatenate([first, loops[:, 0]]), np.concatenate([first + 1, loops[:, 1]])
+    # a sum of none would be no edge at all
+    lengths = np.concatenate([np.maximum(np.diff(run), 1e-6), np.full(len(loops), _ACROSS)])
+    # of edges given twice a sparse matrix takes the sum
+    key, index = np.unique(rows * count + columns, return_index=True)
+    ways = csr_array((lengths[index], (key // count, key % count)), shape=(count, count))
+    return dijkstra(ways, directed=False, indices=[source])[0]
+
+
+_FORM = "time_a time_b [x y z qx qy qz qw]"
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """One line of the file."""
+
+    line: int
+    earlier_ns: int
+    later_ns: int
+    T_earlier_later: NDArray[np.float64] | None
+    """(4, 4) guess of the later pose in the earlier one's frame."""
+
+
+def read_pairs(path: Path) -> list[Pair]:
+    """Read lines ``time_a time_b [x y z qx qy qz qw]``: s, m, pose T_a_b of the body at b in its frame at a.
+
+    Commas may separate the numbers; ``#`` begins a comment. The two times may come in either order.
+
+    Returns:
+        The pairs by their later time.
+
+    Raises:
+        UsageError: there is no such file.
+        LioJaxError: a line is something else; the message names it.
+    """
+    try:
+        text = path.read_text()
+    except OSError as error:
+        raise UsageError(f"{path}: the pairs of times cannot be read ({error.strerror}).") from None
+    except UnicodeDecodeError:
+        raise LioJaxError(
+            f"{path}: not a text file; give lines of 'time_a time_b [x y z qx qy qz qw]'."
+        ) from None
+    pairs = []
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split("#")[0].replace(",", " ").split()
+        if words:
+            pairs.append(_pair(words, number, f"{path}, line {number}"))
+    return sorted(pairs, key=lambda pair: pair.later_ns)
+
+
+def keyframe_at(keyframes: Sequence[Keyframe], stamp_ns: int) -> int | None:
+    """Return the last keyframe up to a time: had the body moved away, there would be a later one.
+
+    Args:
+        keyframes: all up to the time, at least.
+        stamp_ns: the time.
+
+    Returns:
+        Its index; None before the first.
+    """
+    after = bisect_right(keyframes, stamp_ns, key=lambda keyframe: keyframe.stamp_ns)
+    return after - 1 if after else None
+
+
+def _pair(words: list[str], number: int, place: str) -> Pair:
+    if len(words) not in (2, 9):
+        raise LioJaxError(
+            f"{place}: {len(words)} numbers; give two times and, if it is known, the pose between them: "
+            f"{_FORM}."
+        )
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        raise LioJaxError(f"{place}: '{' '.join(words)}' are not all numbers.") from None
+    if not all(math.isfinite(value) for value in values):
+        raise LioJaxError(f"{place}: '{' '.join(words)}' are not all finite.")
+    a, b = seconds_to_ns(words[0]), seconds_to_ns(words[1])
+    if a == b:
+        raise LioJaxError(f"{place}: both times are {words[0]}; a loop needs two.")
+    T_a_b = _pose(values[2:], place) if len(values) > 2 else None
+    if a < b:
+        return Pair(number, a, b, T_a_b)
+    T_b_a = None if T_a_b is None else np.linalg.inv(T_a_b).astype(np.float64)
+    return Pair(number, b, a, T_b_a)
+
+
+def _pose(values: list[float], place: str) -> NDArray[np.float64]:
+    pose = np.eye(4)
+    pose[:3, 3] = values[:3]
+    quaternion = np.array(values[3:])
+    norm = np.linalg.norm(quaternion)
+    if not abs(norm - 1) < 1e-2:
+        raise LioJaxError(f"{place}: the quaternion x y z w has norm {norm:.4g}; give one of unit length.")
+    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    return pose
+
 
 Origin = Literal["radius", "descriptor", "external"]
 

@@ -22,14 +22,11 @@ from lio_jax.core.params import Params, default_params
 from lio_jax.core.settings import Settings
 from lio_jax.core.types import state_dtype
 from lio_jax.loops.alignment import aligned
-from lio_jax.loops.comparison import LEAST_POINTS, Candidate, Comparison
-from lio_jax.loops.drift import possible_error
-from lio_jax.loops.evidence import conflict
-from lio_jax.loops.host_poses import heading_of
-from lio_jax.loops.keyframe import Keyframe
+from lio_jax.loops.keyframe import Keyframe, level_points, padded, thinned
+from lio_jax.loops.overlap import LEAST_POINTS, Candidate, Comparison, conflict
 from lio_jax.loops.plan_view import SOURCE_REACH, TARGET_REACH, Fits, fits, upright_cells
-from lio_jax.loops.proposals import Proposal, is_old
-from lio_jax.loops.surroundings import level_points, padded, thinned
+from lio_jax.loops.proposals import Proposal, is_old, possible_error
+from lio_jax.pose_graph.graph import heading_of
 
 _Array = NDArray[np.float64]
 

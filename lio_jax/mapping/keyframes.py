@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
-from lio_jax.core.materialise import materialised
 from lio_jax.core.params import SubmapParams
+from lio_jax.core.xla import computed_once
 
 
 class KeyframeCloud(eqx.Module):
@@ -157,5 +157,5 @@ def _compacted(
 ) -> tuple[Float32[Array, "n 3"], Int32[Array, ""]]:
     """Return the real points first, and their number."""
     count = jnp.cumsum(mask, dtype=jnp.int32)
-    place = materialised(jnp.where(mask, count - 1, len(mask)))
+    place = computed_once(jnp.where(mask, count - 1, len(mask)))
     return jnp.zeros_like(points).at[place].set(points, mode="drop"), count[-1]

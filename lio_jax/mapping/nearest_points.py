@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
-from lio_jax.core.materialise import materialised
 from lio_jax.core.prefix_sum import running_count
+from lio_jax.core.xla import computed_once
 from lio_jax.mapping.hash_slots import find_slots
 from lio_jax.mapping.point_map import EDGE, VOXELS, PointMap
 
@@ -112,7 +112,7 @@ class _Search(eqx.Module):
         own = jnp.floor(scaled)
         side = jnp.where(scaled - own > 0.5, 1, -1).astype(jnp.int32)
         local = own.astype(jnp.int32) + blocks[:, None] * side
-        slot = materialised(find_slots(self.pmap.block, local + self.anchor))
+        slot = computed_once(find_slots(self.pmap.block, local + self.anchor))
         bits = (len(blocks) * VOXELS - 1).bit_length()
         distance_bits = jnp.int32(-1 << bits)
 
@@ -127,9 +127,9 @@ class _Search(eqx.Module):
             squared = jnp.where(held[:, None] >= 0, squared, jnp.inf)
             key = jax.lax.bitcast_convert_type(squared, jnp.int32) & distance_bits
             # queries side by side in memory: the network's loops run over them
-            keys = materialised((key | (number * VOXELS + jnp.arange(VOXELS, dtype=jnp.int32))).T)
+            keys = computed_once((key | (number * VOXELS + jnp.arange(VOXELS, dtype=jnp.int32))).T)
             # in memory of its own: a loop that reads what it carries is not vectorised
-            nearest = materialised(nearest)
+            nearest = computed_once(nearest)
             for candidate in range(VOXELS):
                 nearest = _with_candidate(nearest, keys[candidate])
             return nearest

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
-from lio_jax.core.materialise import materialised
+from lio_jax.core.xla import computed_once
 from lio_jax.mapping.hash_slots import FREE, claim_slots, free_keys
 
 EDGE = 3
@@ -132,18 +132,18 @@ def insert(
     local = jnp.floor(cell / EDGE)
     block = local.astype(jnp.int32) + anchor
     inside = mask & _inside(block, pmap.cube, half_side)
-    keys, slot = materialised(claim_slots(pmap.block, block, inside))
+    keys, slot = computed_once(claim_slots(pmap.block, block, inside))
     x, y, z = jnp.moveaxis((cell - EDGE * local).astype(jnp.int32), -1, 0)
     voxel = jnp.clip((x * EDGE + y) * EDGE + z, 0, VOXELS - 1)
     x, y, z = (points[:, axis] - (cell[:, axis] + 0.5) * voxel_size for axis in range(3))
     off_centre = jnp.sqrt(x**2 + y**2 + z**2)
     target = jnp.where(slot >= 0, slot, capacity)
     held = pmap.off_centre.at[target, voxel].get(mode="fill", fill_value=-jnp.inf)
-    nearer = materialised(off_centre < held - nearer_by)
+    nearer = computed_once(off_centre < held - nearer_by)
     target = jnp.where(nearer, target, capacity)
     best = pmap.off_centre.at[target, voxel].min(off_centre, mode="drop")
     added = nearer & (best.at[target, voxel].get(mode="fill", fill_value=-1.0) == off_centre)
-    target = materialised(jnp.where(added, target, capacity))
+    target = computed_once(jnp.where(added, target, capacity))
     point = pmap.point
     for axis in range(3):
         offset = points[:, axis] - (local[:, axis] + 0.5) * EDGE * voxel_size

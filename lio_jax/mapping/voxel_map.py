@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float, Float32, Int32, UInt32
 
 from lio_jax.core.geometry import eigenvalues_and_normal3
 from lio_jax.core.hashing import voxel_hash
-from lio_jax.core.materialise import materialised
 from lio_jax.core.prefix_sum import running_count
+from lio_jax.core.xla import computed_once
 
 WAYS = 2
 """Slots a voxel may lie in: neighbours in memory, so that both are read together."""
@@ -107,7 +107,7 @@ def query_nearest(
     own = jnp.floor(scaled)
     side = jnp.where(scaled - own > 0.5, 1, -1).astype(jnp.int32)
     local = own.astype(jnp.int32) + _OFFSETS[:, None] * side
-    slots = materialised(find_slots(vmap, local + anchor))
+    slots = computed_once(find_slots(vmap, local + anchor))
     held = jnp.maximum(slots, 0)
     away = points - _mean(vmap, held, local, voxel_size)
     usable = (slots >= 0) & (_take(vmap.centroid, (held, 3)) >= min_points)
@@ -116,7 +116,7 @@ def query_nearest(
     for other, slot in zip(squared, slots, strict=True):
         nearest = jnp.where(other < distance, slot, nearest)
         distance = jnp.minimum(other, distance)
-    nearest = materialised(nearest)
+    nearest = computed_once(nearest)
     found = jnp.maximum(nearest, 0)
     plane = _take(vmap.plane, found)
     return Planes(
@@ -154,7 +154,7 @@ def insert(
     points = points.astype(jnp.float32)
     grid = _Grid(anchor, voxel_size, reach)
     voxel, cell, _ = grid.places(points)
-    slot = materialised(find_slots(vmap, voxel))
+    slot = computed_once(find_slots(vmap, voxel))
     new = mask & ~((slot >= 0) & _held(vmap, slot, cell))
     rank = running_count(new) - 1
     batch = min(_BATCH, count)
@@ -213,7 +213,7 @@ def _insert_new(
     capacity = vmap.voxel.shape[0]
     voxel, cell, offset = grid.places(points)
     slot, fresh, homeless = _claim_slots(vmap, voxel, mask, grid.anchor, grid.reach / grid.voxel_size)
-    slot, fresh, homeless = materialised((slot, fresh, homeless))
+    slot, fresh, homeless = computed_once((slot, fresh, homeless))
     cleared = jnp.where(fresh, slot, capacity)
     table_voxel = vmap.voxel.at[cleared].set(voxel, mode="drop")
     moments = vmap.moments.at[cleared].set(0.0, mode="drop")
@@ -221,7 +221,7 @@ def _insert_new(
     vmap = VoxelMap(table_voxel, moments, cells, vmap.centroid, vmap.plane)
 
     fills = _one_per_cell((slot >= 0) & ~_held(vmap, slot, cell), voxel * SUBDIVISION + cell)
-    target = materialised(jnp.where(fills, slot, capacity))
+    target = computed_once(jnp.where(fills, slot, capacity))
     x, y, z = jnp.moveaxis(offset, -1, 0)
     row = jnp.stack([jnp.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z], -1)
     moments = moments.at[target].add(row, mode="drop")

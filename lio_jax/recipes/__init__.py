@@ -12,8 +12,8 @@ RECIPES: dict[str, ModuleType] = {
     "loam": loam,
 }
 """By name; each module has State, Output, init(config, params, imu), step(config, params, state, scan, imu)
-and moving_as(fresh, found), which gives a first state the motion of a later one: a vehicle that is already
-moving distorts its first scan, which nothing can compensate until the second."""
+and with_velocity_of(fresh, found), which gives a first state the motion of a later one: a vehicle that is
+already moving distorts its first scan, which nothing can compensate until the second."""
 
 
 def recipe_named(name: str) -> ModuleType:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.error_state import DOF, VELOCITY, Swept, Uncertain
+from lio_jax.core.error_state import DOF, VELOCITY, NavEstimate, SweptState
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan, initial_nav_state
 from lio_jax.imu.discretise import UNKNOWN_ACCEL, UNKNOWN_RATE
@@ -21,12 +21,12 @@ _WEIGHTLESS = 1e-9
 """Share of gravity that is left: none at all would have no direction."""
 
 
-def unlevelled_start(params: Params) -> Uncertain:
+def unlevelled_start(params: Params) -> NavEstimate:
     """Return the state at the world's origin, with its first pose as the world's axes and any velocity."""
     nav = initial_nav_state(params.extrinsics.T_imu_lidar())
     # nothing tells biases, gravity or the extrinsic from the motion: they stay as they are
     sigma = jnp.zeros(DOF, nav.velocity.dtype).at[VELOCITY].set(MOVING_SPEED)
-    return Uncertain(nav, jnp.diag(sigma**2))
+    return NavEstimate(nav, jnp.diag(sigma**2))
 
 
 def until_its_middle(scan: Scan, to_last_end: Float[Array, ""]) -> Scan:
@@ -58,8 +58,8 @@ def mean_rate(last: NavState, nav: NavState, scan: Scan) -> Float[Array, "3"]:
 
 
 def predicted_without_samples(
-    params: Params, last: Uncertain, rate: Float[Array, "3"], scan: Scan, first: Bool[Array, ""]
-) -> tuple[Swept, Path]:
+    params: Params, last: NavEstimate, rate: Float[Array, "3"], scan: Scan, first: Bool[Array, ""]
+) -> tuple[SweptState, Path]:
     """Return the state at the scan's end and the motion since the last one's if the body went on as it moved.
 
     Args:
@@ -82,7 +82,7 @@ def predicted_without_samples(
     samples = _imagined_samples(floating, rate, scan)
     prior, path = predicted(
         dataclasses.replace(params, imu=imu),
-        Uncertain(floating, last.covariance),
+        NavEstimate(floating, last.covariance),
         scan,
         samples,
         first,
@@ -90,7 +90,7 @@ def predicted_without_samples(
         sweep_start=scan.duration,
     )
     nav = dataclasses.replace(prior.nav, gravity=last.nav.gravity)
-    return Swept(nav, prior.covariance), path
+    return SweptState(nav, prior.covariance), path
 
 
 def _imagined_samples(nav: NavState, rate: Float[Array, "3"], scan: Scan) -> ImuBatch:

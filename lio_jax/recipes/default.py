@@ -26,7 +26,7 @@ def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
     return lidar_inertial.init(config, params, imu)
 
 
-def moving_as(fresh: State, found: State) -> State:
+def with_velocity_of(fresh: State, found: State) -> State:
     """Return the state before the first scan with the velocity of another: a mere exchange of leaves."""
     return eqx.tree_at(_velocity, fresh, _velocity(found))
 

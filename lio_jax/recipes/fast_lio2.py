@@ -15,13 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.config import Config
-from lio_jax.core.error_state import Uncertain
+from lio_jax.core.error_state import NavEstimate
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
 from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.imu.path import deskew_along
-from lio_jax.lidar.voxel_mean import mean_per_voxel
+from lio_jax.lidar.thinning import mean_per_voxel
 from lio_jax.mapping.point_map import EDGE, PointMap, empty_map, insert, move_cube
 from lio_jax.mapping.voxel_map import anchor_of
 from lio_jax.recipes.constant_velocity import (
@@ -43,7 +43,7 @@ from lio_jax.recipes.inertial_filter import (
 from lio_jax.recipes.output import Output
 from lio_jax.registration.association import Association, associated, no_association
 from lio_jax.registration.knn_planes import Planes, associate, linearise, no_planes
-from lio_jax.registration.scan_to_map import Frame
+from lio_jax.registration.voxel_plane_icp import Frame
 
 
 class State(eqx.Module):
@@ -51,7 +51,7 @@ class State(eqx.Module):
 
     nav: NavState
     """At the last scan's end."""
-    uncertain: Uncertain
+    uncertain: NavEstimate
     """What the filter estimates: the navigation state at the last scan's end, and its covariance. Without
     inertial samples that at the scan's middle, where an error of the velocity distorts the scan least."""
     rate: Float[Array, "3"]
@@ -76,7 +76,7 @@ def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
     return State(start.nav, start, none, none[0], jnp.int32(0), empty_map(config.map.capacity))
 
 
-def moving_as(fresh: State, found: State) -> State:
+def with_velocity_of(fresh: State, found: State) -> State:
     """Return the state before the first scan with the motion of another: a mere exchange of leaves."""
     return eqx.tree_at(_motion, fresh, _motion(found))
 
@@ -118,7 +118,7 @@ def step(
         frame = Frame(*anchor_of(T_predicted.translation(), EDGE * params.map.voxel_size))
         scan_match = _ScanMatch(state.map, thin.points, thin.mask, frame, params, config.knn.neighbours)
         update, _ = corrected(config, params, prior, scan_match, scan_match.before(prior.nav))
-        posterior: Uncertain = update.state
+        posterior: NavEstimate = update.state
         lost = (update.status > ITERATION_LIMIT) & ~first
         T_world_lidar = lidar_pose(posterior.nav)
     with jax.named_scope("insert"):

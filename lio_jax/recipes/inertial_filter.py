@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.blocks import from_blocks
 from lio_jax.core.config import Config
 from lio_jax.core.error_state import (
     DOF,
@@ -18,12 +17,12 @@ from lio_jax.core.error_state import (
     POSITION,
     ROTATION,
     VELOCITY,
-    Swept,
-    Uncertain,
+    NavEstimate,
+    SweptState,
     sphere_basis,
 )
+from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
 from lio_jax.core.params import Params
-from lio_jax.core.rotation import rotation_matrix, skew
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import Measurement, Update
 from lio_jax.estimation.nav_update import predicted_pose_covariance, update_nav
@@ -35,7 +34,7 @@ from lio_jax.registration.gauss_newton import NormalEquations, Registration
 from lio_jax.registration.point_evidence import PointEvidence
 
 
-def levelled_start(params: Params, imu: ImuBatch) -> Uncertain:
+def levelled_start(params: Params, imu: ImuBatch) -> NavEstimate:
     """Return the state at the world's origin, levelled by the samples, as if the vehicle were at rest.
 
     Args:
@@ -52,7 +51,7 @@ def levelled_start(params: Params, imu: ImuBatch) -> Uncertain:
     return held_at_lidar(start.start)
 
 
-def held_at_lidar(state: Uncertain) -> Uncertain:
+def held_at_lidar(state: NavEstimate) -> NavEstimate:
     """Return a first state whose lidar pose is certain: it defines the map's frame.
 
     If the extrinsic is off, then so is the pose of the IMU in that frame, and with it the direction in which
@@ -71,17 +70,17 @@ def held_at_lidar(state: Uncertain) -> Uncertain:
         (GRAVITY, EXTRINSIC_ROTATION, sphere_basis(nav.gravity).T @ R_world_imu @ turn),
     )
     covariance = carried @ state.covariance @ carried.T
-    return Uncertain(nav, (covariance + covariance.T) / 2)
+    return NavEstimate(nav, (covariance + covariance.T) / 2)
 
 
 def predicted(
     params: Params,
-    last: Uncertain,
+    last: NavEstimate,
     scan: Scan,
     imu: ImuBatch,
     first: Bool[Array, ""],
     sweep_start: Float[Array, ""] | float = 0.0,
-) -> tuple[Swept, Path]:
+) -> tuple[SweptState, Path]:
     """Return the state at the scan's end and the motion since the last scan's end.
 
     Args:
@@ -99,10 +98,10 @@ def predicted(
     moved, path = propagate_sweep(last, imu, params.imu, start, end, sweep_start)
     # the first scan's end is the world's origin: its samples only deskew it
     opened = _held_at_mean(last, jnp.where(jnp.any(scan.mask), end - sweep_start, 0.0))
-    return jax.tree.map(lambda new, old: jnp.where(first, old, new), moved, Swept.at_once(opened)), path
+    return jax.tree.map(lambda new, old: jnp.where(first, old, new), moved, SweptState.at_once(opened)), path
 
 
-def _held_at_mean(state: Uncertain, sweep: Float[Array, ""]) -> Uncertain:
+def _held_at_mean(state: NavEstimate, sweep: Float[Array, ""]) -> NavEstimate:
     """Return a first state that is certain in its sweep's mean instead of its end.
 
     A wrong velocity shifts the first scan in the map by what it shifts the mean of the second by, seen from
@@ -115,7 +114,7 @@ def _held_at_mean(state: Uncertain, sweep: Float[Array, ""]) -> Uncertain:
     identity = jnp.eye(DOF, dtype=state.covariance.dtype)
     carried = identity.at[POSITION, VELOCITY].set(sweep / 2 * jnp.eye(3, dtype=identity.dtype))
     covariance = carried @ state.covariance @ carried.T
-    return Uncertain(state.nav, (covariance + covariance.T) / 2)
+    return NavEstimate(state.nav, (covariance + covariance.T) / 2)
 
 
 @runtime_checkable
@@ -132,7 +131,7 @@ class ScanMatch(Protocol):
 
 
 def corrected(
-    config: Config, params: Params, prior: Swept, scan_match: ScanMatch, before: Any
+    config: Config, params: Params, prior: SweptState, scan_match: ScanMatch, before: Any
 ) -> tuple[Update, NavState]:
     """Return the update by a scan match, and the state with the pose at which the scan lies on the map.
 
@@ -186,7 +185,7 @@ def registration_of(update: Update, last: Linearised, T_world_lidar: jaxlie.SE3)
     )
 
 
-def evidence_of(update: Update, prior: Swept, points: PointEvidence | None = None) -> Evidence:
+def evidence_of(update: Update, prior: SweptState, points: PointEvidence | None = None) -> Evidence:
     """Return how well a scan was foretold."""
     measured = update.measurement
     return Evidence(

@@ -11,8 +11,8 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.config import Config
-from lio_jax.core.error_state import Uncertain
-from lio_jax.core.implicit import known
+from lio_jax.core.error_state import NavEstimate
+from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
@@ -33,13 +33,13 @@ from lio_jax.recipes.inertial_filter import (
 from lio_jax.recipes.output import Output
 from lio_jax.registration.association import Association, associated, no_association
 from lio_jax.registration.point_evidence import point_evidence
-from lio_jax.registration.scan_to_map import Frame, Matches, associate, linearise, no_matches
+from lio_jax.registration.voxel_plane_icp import Frame, Matches, associate, linearise, no_matches
 
 
 class State(eqx.Module):
     """What is carried from scan to scan."""
 
-    uncertain: Uncertain
+    uncertain: NavEstimate
     """Navigation state at the last scan's end, and the covariance of its error within the map."""
     drift: MapDrift
     prediction_error: Float[Array, ""]
@@ -95,7 +95,7 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
         frame = Frame(*anchor_of(T_predicted.translation(), params.map.voxel_size))
         scan_match = _ScanMatch(state.map, to_match, thin.matched.mask, frame, state.prediction_error, params)
         update, matched = corrected(config, params, prior, scan_match, scan_match.before(T_predicted))
-        posterior: Uncertain = update.state
+        posterior: NavEstimate = update.state
         lost = (update.status > ITERATION_LIMIT) & ~first
         T_world_lidar, T_matched = lidar_pose(posterior.nav), lidar_pose(matched)
         matches = update.measurement.aux.association.found
@@ -154,7 +154,9 @@ def _to_match(
 ) -> Float[Array, "k 3"]:
     """Return the compensated points to match: only these few need a derivative."""
     index = thin.matched.index
-    return known(deskewed[index], deskew_along, path, T_imu_lidar, thin.points[index], thin.time[index])
+    return with_derivative_of(
+        deskewed[index], deskew_along, path, T_imu_lidar, thin.points[index], thin.time[index]
+    )
 
 
 class _ScanMatch(eqx.Module):

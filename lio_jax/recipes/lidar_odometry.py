@@ -17,7 +17,7 @@ from lio_jax.lidar.thinning import thinned
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
 from lio_jax.recipes.output import Output
 from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES
-from lio_jax.registration.scan_to_map import Frame, register
+from lio_jax.registration.voxel_plane_icp import Frame, register
 
 
 class State(eqx.Module):

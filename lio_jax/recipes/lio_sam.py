@@ -17,14 +17,14 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int32
 
-from lio_jax.core.blocks import from_blocks
 from lio_jax.core.config import Config
 from lio_jax.core.error_state import DOF as NAV_DOF
 from lio_jax.core.errors import UsageError
+from lio_jax.core.geometry import from_blocks
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan, state_dtype
 from lio_jax.estimation.chain import information_of, linearise
-from lio_jax.estimation.evidence import log_evidence
+from lio_jax.estimation.marginal_likelihood import log_evidence
 from lio_jax.estimation.motion_state import DOF
 from lio_jax.estimation.sliding_window import Added, Window, append_and_update
 from lio_jax.estimation.smoother import Smoothed
@@ -32,17 +32,22 @@ from lio_jax.imu.path import Path, deskew_along
 from lio_jax.imu.preintegration import preintegrate_parallel
 from lio_jax.imu.sampling import sample_intervals
 from lio_jax.imu.strapdown import path_along
-from lio_jax.lidar.features import FeatureCloud, check_sizes, lio_sam_features
-from lio_jax.lidar.thinned_features import in_single_precision, thinned_features
+from lio_jax.lidar.features import (
+    FeatureCloud,
+    check_sizes,
+    in_single_precision,
+    lio_sam_features,
+    thinned_features,
+)
 from lio_jax.mapping.keyframes import is_due, no_keyframes
 from lio_jax.recipes.inertial_filter import levelled_start, lidar_pose
 from lio_jax.recipes.output import Output
 from lio_jax.recipes.pose_limits import drawn_to_tilt, measured_attitude, within_limits
 from lio_jax.recipes.smoothed_odometry import match_as_measurement, opened, runs_away
+from lio_jax.registration.feature_icp import register_features
 from lio_jax.registration.feature_map import empty_feature_map
 from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES
 from lio_jax.registration.lines_and_planes import FeaturePoints
-from lio_jax.registration.rounds import match_in_rounds
 from lio_jax.registration.submap import ScanToSubmap, Submap, with_scan
 
 
@@ -105,7 +110,7 @@ def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
     )
 
 
-def moving_as(fresh: State, found: State) -> State:
+def with_velocity_of(fresh: State, found: State) -> State:
     """Return the state before the first scan with the velocity of another: a mere exchange of leaves."""
     rows = fresh.window.states.velocity
     velocity = found.nav.velocity
@@ -163,7 +168,7 @@ def step(
             params=params,
             neighbours=config.knn.neighbours,
         )
-        match = match_in_rounds(task, config.registration.max_iterations, 1)
+        match = register_features(task, config.registration.max_iterations, 1)
         due = time - state.matched_at >= params.smoother.mapping_interval - _TIME_SLACK
         lost = ((match.status == TOO_FEW_MATCHES) | ~enough) & ~first
         matched = due & ~lost & ~first

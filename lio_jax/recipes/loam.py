@@ -20,14 +20,20 @@ from lio_jax.core.config import Config
 from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan, initial_nav_state
 from lio_jax.lidar.deskew import deskew_constant_velocity
-from lio_jax.lidar.features import FeatureCloud, LoamFeatures, check_sizes, loam_features
-from lio_jax.lidar.thinned_features import in_single_precision, thinned_features
+from lio_jax.lidar.features import (
+    FeatureCloud,
+    LoamFeatures,
+    check_sizes,
+    in_single_precision,
+    loam_features,
+    thinned_features,
+)
 from lio_jax.recipes.output import Output
 from lio_jax.registration.cube_map import ScanToCubes, added_to
+from lio_jax.registration.feature_icp import register_features
 from lio_jax.registration.feature_map import FeatureMap, empty_feature_map, frames_at, placed_in
 from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES, Registration
 from lio_jax.registration.lines_and_planes import FeaturePoints
-from lio_jax.registration.rounds import match_in_rounds
 from lio_jax.registration.scan_to_scan import LastScan, ScanToScan, empty_scan, last_scan
 
 
@@ -85,7 +91,7 @@ def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
     )
 
 
-def moving_as(fresh: State, found: State) -> State:
+def with_velocity_of(fresh: State, found: State) -> State:
     """Return the state before the first scan with the velocity of another: a mere exchange of leaves."""
     return eqx.tree_at(lambda state: state.twist, fresh, found.twist)
 
@@ -117,7 +123,7 @@ def step(
         prediction = jaxlie.SE3.exp(elapsed * state.twist)
         # no velocity is known yet
         opening = (state.scans == 1) | jnp.all(state.twist == 0)
-        odometry = match_in_rounds(
+        odometry = register_features(
             ScanToScan(last=state.map.last, compensated=picks, T_predicted=prediction, params=params),
             jnp.where(opening, jnp.int32(config.loam.opening_rounds), jnp.int32(config.loam.rounds)),
             config.registration.max_iterations,
@@ -230,7 +236,7 @@ def _mapped(
         task = ScanToCubes(
             map=cubes, points=points, T_predicted=guess, params=params, neighbours=config.knn.neighbours
         )
-        found = match_in_rounds(task, config.loam.rounds, config.registration.max_iterations)
+        found = register_features(task, config.loam.rounds, config.registration.max_iterations)
         # the points' compensation rests on the odometry
         unfinished = (found.status == CONVERGED) & (odometry.status == ITERATION_LIMIT)
         return dataclasses.replace(found, status=jnp.where(unfinished, ITERATION_LIMIT, found.status))

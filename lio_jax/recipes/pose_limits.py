@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
+from lio_jax.core.geometry import rotation_matrix
 from lio_jax.core.params import SmootherParams
-from lio_jax.core.rotation import rotation_matrix
 from lio_jax.core.types import ImuBatch
 
 

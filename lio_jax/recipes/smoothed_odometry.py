@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.blocks import from_blocks
 from lio_jax.core.config import Config
 from lio_jax.core.error_state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
+from lio_jax.core.geometry import from_blocks
 from lio_jax.core.params import Params
 from lio_jax.core.types import NavState
 from lio_jax.estimation.marginal_prior import gaussian_prior

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.rotation import rotation_matrix
+from lio_jax.core.geometry import rotation_matrix
 
 _Found = TypeVar("_Found")
 """What the points were associated with, as a pytree of arrays."""

@@ -12,7 +12,7 @@ from lio_jax.mapping.point_map import Insertion, PointMap, shift_box
 from lio_jax.registration import feature_map
 from lio_jax.registration.feature_map import FeatureMap
 from lio_jax.registration.lines_and_planes import FeaturePoints, Frames
-from lio_jax.registration.scan_to_map import Frame
+from lio_jax.registration.voxel_plane_icp import Frame
 
 
 class ScanToCubes(feature_map.ScanToMap):

@@ -13,10 +13,10 @@ from jaxtyping import Array, Bool, Float
 from lio_jax.core.params import Params
 from lio_jax.mapping.point_map import EDGE, Insertion, PointMap, empty_map, insert
 from lio_jax.mapping.voxel_map import anchor_of
+from lio_jax.registration.feature_icp import ScanRegistration
 from lio_jax.registration.knn_planes import planes_near
 from lio_jax.registration.lines_and_planes import FeaturePoints, Frames, LinesAndPlanes, lines_near
-from lio_jax.registration.rounds import Task
-from lio_jax.registration.scan_to_map import Frame
+from lio_jax.registration.voxel_plane_icp import Frame
 
 
 class FeatureMap(eqx.Module):
@@ -37,7 +37,7 @@ def frames_at(position: Float[Array, "3"], params: Params) -> Frames:
     return Frames(*(Frame(*anchor_of(position, EDGE * size)) for size in sizes))
 
 
-class ScanToMap(Task):
+class ScanToMap(ScanRegistration):
     """A scan's compensated corners and surface points, and the map."""
 
     map: FeatureMap

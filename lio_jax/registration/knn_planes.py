@@ -6,12 +6,12 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.geometry import eigenvalues_and_normal3
-from lio_jax.core.materialise import materialised
 from lio_jax.core.params import KnnParams, Params
+from lio_jax.core.xla import computed_once
 from lio_jax.mapping.nearest_points import nearest_points
 from lio_jax.mapping.point_map import PointMap
 from lio_jax.registration.gauss_newton import NormalEquations
-from lio_jax.registration.scan_to_map import Frame
+from lio_jax.registration.voxel_plane_icp import Frame
 
 _Coordinates = Float32[Array, "n k"]
 """One coordinate of n points in each of k columns."""
@@ -47,7 +47,7 @@ def associate(
     ``params.knn.plane_tolerance`` of the plane.
     """
     _, placed = frame.place(jnp.where(mask[:, None], points, 0.0), T_world_lidar)
-    placed = materialised(placed)
+    placed = computed_once(placed)
     return planes_near(pmap, placed, mask, frame.anchor, params.map.voxel_size, params.knn, neighbours)
 
 
@@ -110,7 +110,7 @@ def fit_planes(x: _Coordinates, y: _Coordinates, z: _Coordinates) -> tuple[Plane
         The planes, all called valid, and the largest distance of each plane's own points from it, m.
     """
     (cx, cy, cz), (qx, qy, qz), moments = spread(x, y, z)
-    _, normal = materialised(eigenvalues_and_normal3(moments[:, :3], moments[:, 3:]))
+    _, normal = computed_once(eigenvalues_and_normal3(moments[:, :3], moments[:, 3:]))
     nx, ny, nz = normal[:, 0], normal[:, 1], normal[:, 2]
     farthest = jnp.max(jnp.abs(nx * qx + ny * qy + nz * qz), 0)
     return Planes(normal, -(nx * cx + ny * cy + nz * cz), jnp.ones(x.shape[1], bool)), farthest
@@ -128,10 +128,10 @@ def spread(
         The moments divided by the number of points, xx, yy, zz, xy, xz and yz, m^2.
     """
     n = x.shape[0]
-    cx, cy, cz = materialised((jnp.sum(x, 0) / n, jnp.sum(y, 0) / n, jnp.sum(z, 0) / n))
+    cx, cy, cz = computed_once((jnp.sum(x, 0) / n, jnp.sum(y, 0) / n, jnp.sum(z, 0) / n))
     qx, qy, qz = x - cx, y - cy, z - cz
     pairs = ((qx, qx), (qy, qy), (qz, qz), (qx, qy), (qx, qz), (qy, qz))
-    moments = materialised(jnp.stack([jnp.sum(u * v, 0) / n for u, v in pairs], -1))
+    moments = computed_once(jnp.stack([jnp.sum(u * v, 0) / n for u, v in pairs], -1))
     return (cx, cy, cz), (qx, qy, qz), moments
 
 
@@ -159,7 +159,7 @@ def linearise(
     dtype, kind = T_world_lidar.wxyz_xyz.dtype, points.dtype
     knn = params.knn
     arm, placed = frame.place(jnp.where(planes.valid[:, None], points, 0.0), T_world_lidar)
-    (px, py, pz), (rx, ry, rz), (nx, ny, nz) = materialised(
+    (px, py, pz), (rx, ry, rz), (nx, ny, nz) = computed_once(
         (tuple(placed.T), tuple(arm.T), tuple(planes.normal.T))
     )
     distance = nx * px + ny * py + nz * pz + planes.offset

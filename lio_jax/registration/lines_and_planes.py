@@ -13,12 +13,12 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.geometry import across, eigenvalues_and_normal3
-from lio_jax.core.materialise import materialised
 from lio_jax.core.params import KnnParams
+from lio_jax.core.xla import computed_once
 from lio_jax.mapping.point_map import PointMap
 from lio_jax.registration.gauss_newton import NormalEquations
 from lio_jax.registration.knn_planes import Planes, match_score, neighbours_within, no_planes, spread
-from lio_jax.registration.scan_to_map import Frame
+from lio_jax.registration.voxel_plane_icp import Frame
 
 _Coordinates = Float32[Array, "n k"]
 """One coordinate of n points in each of k columns."""
@@ -75,7 +75,7 @@ def line_through(
     def plane(normal: Array) -> Planes:
         return Planes(normal, -(normal[:, 0] * cx + normal[:, 1] * cy + normal[:, 2] * cz), valid)
 
-    first, second = materialised(across(direction))
+    first, second = computed_once(across(direction))
     return Lines(plane(first), plane(second))
 
 
@@ -94,7 +94,7 @@ def fit_lines(
     """
     centre, _, moments = spread(x, y, z)
     # the largest eigenvalue is the smallest one of the negative
-    negative, direction = materialised(eigenvalues_and_normal3(-moments[:, :3], -moments[:, 3:]))
+    negative, direction = computed_once(eigenvalues_and_normal3(-moments[:, :3], -moments[:, 3:]))
     lines = line_through(centre, direction, jnp.ones(x.shape[1], bool))
     return lines, direction, -negative[:, ::-1]
 
@@ -227,7 +227,7 @@ class _Rows(eqx.Module):
     def of(planes: Planes, points: Array, T_world_lidar: jaxlie.SE3, frame: Frame) -> "_Rows":
         arm, placed = frame.place(jnp.where(planes.valid[:, None], points, 0.0), T_world_lidar)
         normal = jnp.where(planes.valid[:, None], planes.normal, 0.0)
-        (px, py, pz), (rx, ry, rz), (nx, ny, nz) = materialised(
+        (px, py, pz), (rx, ry, rz), (nx, ny, nz) = computed_once(
             (tuple(placed.T), tuple(arm.T), tuple(normal.T))
         )
         offset = jnp.where(planes.valid, planes.offset, 0.0)

@@ -7,8 +7,15 @@ import jaxlie
 from jaxtyping import Array, Float
 
 from lio_jax.core.params import Params
-from lio_jax.registration.placed_sums import placed_sums
-from lio_jax.registration.scan_to_map import Frame, Matches, PointNoise, noise_at, point_noise, squares
+from lio_jax.registration.point_sums import point_sums
+from lio_jax.registration.voxel_plane_icp import (
+    Frame,
+    Matches,
+    PointNoise,
+    plane_noise,
+    point_noise,
+    point_variances,
+)
 
 
 class PointEvidence(eqx.Module):
@@ -42,12 +49,12 @@ def point_evidence(
     noise = point_noise(matches, points, T_world_lidar, frame, params)
     # as in iteratively reweighted least squares, the weights are no part of the derivative
     weight = jax.lax.stop_gradient(noise.weight(params.registration.kernel.astype(kind)))
-    sums = placed_sums(
+    sums = point_sums(
         jax.lax.stop_gradient(jnp.sum(_weighted(noise, weight), -1)),
         _rows,
         points,
         *frame.placing(T_world_lidar, kind),
-        jnp.stack(squares(params, kind)),
+        jnp.stack(point_variances(params, kind)),
         (matches, weight),
     ).astype(dtype)
     squared_error, log_det = sums
@@ -56,7 +63,7 @@ def point_evidence(
 
 def _rows(arm: Array, shift: Array, scales: Array, constants: tuple[Matches, Array]) -> Array:
     matches, weight = constants
-    return _weighted(noise_at(matches, arm.T, shift, *scales), weight)
+    return _weighted(plane_noise(matches, arm.T, shift, *scales), weight)
 
 
 def _weighted(noise: PointNoise, weight: Array) -> Array:

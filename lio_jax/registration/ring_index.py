@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float32, Int32
 
-from lio_jax.core.materialise import materialised
 from lio_jax.core.prefix_sum import running_count
+from lio_jax.core.xla import computed_once
 from lio_jax.lidar.range_image import azimuth
 
 _SIDE, _NARROW = 8, 24
@@ -103,7 +103,7 @@ def ring_index(
     count = len(points)
     row_bits = (count - 1).bit_length()
     sectors = min(_SECTORS, 1 << (((1 << (32 - row_bits)) - 1) // rings).bit_length() - 1)
-    x, y, z = materialised(tuple(points.T))
+    x, y, z = computed_once(tuple(points.T))
     angle = azimuth(x, y)
     cell = jnp.where(mask, ring * sectors + _sector(angle, sectors), rings * sectors)
     row = jnp.arange(count, dtype=jnp.uint32)
@@ -203,7 +203,7 @@ class _Search(eqx.Module):
         level = jnp.sqrt(queries.x**2 + queries.y**2)
         number = jnp.arange(self.cloud_rings, dtype=jnp.int32)[:, None]
         elevation = _take(self.index.elevation, queries.lowest + number)
-        away = materialised(jnp.abs(elevation - azimuth(level, queries.z)))
+        away = computed_once(jnp.abs(elevation - azimuth(level, queries.z)))
         own = jnp.min(jnp.where(away == jnp.min(away, 0), number, self.cloud_rings - 1), 0)
         windows = _Windows.of(self, queries, queries.lowest + own, min(side, self.cloud_rings - 1), window)
         place, squared = windows.smallest(windows.keys(), jnp.bool_(True))
@@ -219,7 +219,7 @@ class _Search(eqx.Module):
         queries, nearest = given
         ring = _take(self.index.ring, jnp.maximum(nearest, 0))
         windows = _Windows.of(self, queries, jnp.maximum(ring, 0), _BESIDE, window)
-        keys, step = materialised(windows.keys()), jnp.abs(windows.ring_step())
+        keys, step = computed_once(windows.keys()), jnp.abs(windows.ring_step())
         same, same_squared = windows.smallest(keys, (step == 0) & ~windows.is_at(nearest))
         other, other_squared = windows.smallest(keys, (step > 0) & (step < self.rings_apart))
         farthest = jnp.sqrt(jnp.minimum(jnp.maximum(same_squared, other_squared), self.radius**2))
@@ -251,7 +251,7 @@ class _Search(eqx.Module):
     def _squared(self, queries: Queries) -> Float32[Array, "m k"]:
         index = self.index
         squared = queries.away_from((index.x[:, None], index.y[:, None], index.z[:, None]))
-        return materialised(jnp.where(squared < self.radius**2, squared, jnp.inf))
+        return computed_once(jnp.where(squared < self.radius**2, squared, jnp.inf))
 
 
 def _least(squared: Float32[Array, "m k"], allowed: Bool[Array, "m k"]) -> Int32[Array, " k"]:
@@ -290,7 +290,7 @@ class _Windows(eqx.Module):
         middle = _take(index.first, cell + _sector(azimuth(queries.x, queries.y), sectors)) - start
         begin = middle - jnp.minimum(length, size) // 2
         elevation = _take(index.elevation, band)
-        return _Windows(search, queries, *materialised((start, size, elevation, begin)), length)
+        return _Windows(search, queries, *computed_once((start, size, elevation, begin)), length)
 
     def keys(self) -> Int32[Array, "n k"]:
         """Return the squared distance of each point, the lowest bits replaced by its number.

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float32
 
-from lio_jax.core.materialise import materialised
 from lio_jax.core.params import Params
+from lio_jax.core.xla import computed_once
 from lio_jax.lidar.features import FeatureCloud
+from lio_jax.registration.feature_icp import ScanRegistration
 from lio_jax.registration.knn_planes import Planes
 from lio_jax.registration.lines_and_planes import (
     FeaturePoints,
@@ -23,8 +24,7 @@ from lio_jax.registration.lines_and_planes import (
     line_through,
 )
 from lio_jax.registration.ring_index import Nearest, Queries, RingIndex, nearest_by_ring, ring_index
-from lio_jax.registration.rounds import Task
-from lio_jax.registration.scan_to_map import Frame
+from lio_jax.registration.voxel_plane_icp import Frame
 
 _Vectors = tuple[Array, Array, Array]
 
@@ -63,7 +63,7 @@ def empty_scan(corners: int, surfaces: int, rings: int) -> LastScan:
     return LastScan(ring_index(jnp.zeros((len(none), 3), jnp.float32), none, none > 0, 2 * rings))
 
 
-class ScanToScan(Task):
+class ScanToScan(ScanRegistration):
     """A scan's sharp and flat points, and the last scan. The pose sought is that in the last scan's frame."""
 
     last: LastScan
@@ -91,7 +91,7 @@ class ScanToScan(Task):
         frame, corners = self.frames().corner, len(points.corner)
         _, placed = frame.place(jnp.concatenate([points.corner, points.surface]), T_target_lidar)
         mask = jnp.concatenate([points.corner_mask, points.surface_mask])
-        x, y, z = materialised(tuple(jnp.where(mask[:, None], placed, 0.0).astype(jnp.float32).T))
+        x, y, z = computed_once(tuple(jnp.where(mask[:, None], placed, 0.0).astype(jnp.float32).T))
         index = self.last.index
         rings = len(index.elevation) // 2
         lowest = jnp.where(jnp.arange(len(mask)) < corners, 0, rings).astype(jnp.int32)
@@ -122,9 +122,9 @@ def _lines(index: RingIndex, found: Nearest) -> Lines:
 
 def _planes(index: RingIndex, found: Nearest) -> Planes:
     places = (found.nearest, found.same_ring, found.other_ring)
-    here, along, aside = materialised(tuple(index.at(jnp.maximum(place, 0)) for place in places))
+    here, along, aside = computed_once(tuple(index.at(jnp.maximum(place, 0)) for place in places))
     along, aside = _difference(along, here), _difference(aside, here)
-    normal = materialised(_cross(along, aside))
+    normal = computed_once(_cross(along, aside))
     area = _length(normal)
     valid = (found.same_ring >= 0) & (found.other_ring >= 0) & (area > 0)
     nx, ny, nz = (axis / jnp.where(valid, area, 1.0) for axis in normal)

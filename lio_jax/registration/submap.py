@@ -15,7 +15,7 @@ from lio_jax.mapping.point_map import Insertion, PointMap, move_cube
 from lio_jax.registration import feature_map
 from lio_jax.registration.feature_map import FeatureMap, frames_at, placed_in
 from lio_jax.registration.lines_and_planes import FeaturePoints, Frames, Weights, scored
-from lio_jax.registration.scan_to_map import Frame
+from lio_jax.registration.voxel_plane_icp import Frame
 
 
 class Submap(eqx.Module):

@@ -15,21 +15,17 @@ from lio_jax.core.settings import Settings
 from lio_jax.data.gps_checks import cleaned
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory, ns_to_seconds, write_tum
-from lio_jax.loops.back_end import BackEnd, Correction
+from lio_jax.loops.back_end import BackEnd, Correction, corrected_poses, graph_of
 from lio_jax.loops.closing import LoopCloser
-from lio_jax.loops.drift_correction import corrected_poses
-from lio_jax.loops.g2o import write_graph
 from lio_jax.loops.gps import GpsGate
-from lio_jax.loops.graph import LOOP, ODOMETRY, PoseGraph
-from lio_jax.loops.keyframe_graph import graph_of
-from lio_jax.loops.surroundings import thinned
-from lio_jax.run.beside import BesideOdometry
-from lio_jax.run.cloud_file import read_cloud
+from lio_jax.loops.keyframe import thinned
+from lio_jax.pose_graph.g2o import write_graph
+from lio_jax.pose_graph.graph import LOOP, ODOMETRY, PoseGraph
+from lio_jax.run.backend_thread import BackEndThread
 from lio_jax.run.folder import write_json
-from lio_jax.run.keyframe_store import KeyframeWriter, read_keyframes
-from lio_jax.run.keyframes import KeyframePicker, corner_marks
-from lio_jax.run.map_tiles import MapTiles
-from lio_jax.run.track import Tracked
+from lio_jax.run.keyframes import KeyframePicker, KeyframeWriter, corner_marks, read_keyframes
+from lio_jax.run.map_file import MapTiles, read_cloud
+from lio_jax.run.track import ScanResult
 
 _KEPT_SPACING = 0.4
 """Of the points that keyframes keep in memory for loops, m; on disk they have all."""
@@ -57,9 +53,9 @@ class GlobalCorrection:
         self._settings, self._out = settings, out
         self._origin = sequence.gps().origin if gate else None  # type: ignore[union-attr]
         self._picker, self._store = KeyframePicker(settings), KeyframeWriter(out)
-        self._beside = BesideOdometry(BackEnd(settings, closer, gate))
+        self._beside = BackEndThread(BackEnd(settings, closer, gate))
 
-    def take(self, tracked: Tracked) -> None:
+    def take(self, tracked: ScanResult) -> None:
         """Take the next scan's result; this never waits for the back end."""
         keyframe = self._picker(tracked)
         if keyframe is not None:

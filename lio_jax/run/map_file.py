@@ -1,12 +1,186 @@
-"""Collect the map's points on disk while a run goes on, so that its memory does not grow."""
+"""Point clouds on disk: PCD and PLY files, a map that grows during a run, and a map kept in tiles."""
 
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.files import aside_of
-from lio_jax.run.cloud_file import write_cloud
+from lio_jax.core.errors import LioJaxError, UsageError
+from lio_jax.core.files import aside_of, atomic_path
+
+CLOUD_ENDINGS = (".pcd", ".ply")
+
+
+def check_ending(path: Path) -> None:
+    """Refuse a file whose ending tells no format.
+
+    Raises:
+        UsageError: it does not.
+    """
+    if path.suffix.lower() not in CLOUD_ENDINGS:
+        raise UsageError(f"{path}: a map's name ends in {' or '.join(CLOUD_ENDINGS)}; choose one of them.")
+
+
+def write_cloud(path: Path, parts: Iterable[NDArray[np.float32]], count: int) -> None:
+    """Write points whole or not at all, in binary: PCD or, by the file's ending, PLY (little endian).
+
+    Args:
+        path: of the file.
+        parts: arrays (n, 3) of points, m; taken one by one.
+        count: how many points the parts have together, which both formats say in front.
+
+    Raises:
+        UsageError: another ending.
+        ValueError: the parts have more points or fewer.
+    """
+    check_ending(path)
+    with atomic_path(path) as aside, aside.open("wb") as file:
+        file.write((_ply_header if path.suffix.lower() == ".ply" else _pcd_header)(count))
+        written = sum(_append(file, part) for part in parts)
+        if written != count:
+            raise ValueError(f"{written} points came where {count} were announced")
+
+
+def read_cloud(path: Path) -> NDArray[np.float32]:
+    """Return the (n, 3) points of a PCD, m.
+
+    Raises:
+        LioJaxError: it cannot be read, or holds no x, y and z.
+    """
+    from pypcd4 import PointCloud
+
+    try:
+        return np.asarray(PointCloud.from_path(path).numpy(("x", "y", "z")), np.float32)
+    except Exception as error:  # the library's own, numpy's and pydantic's
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise LioJaxError(f"{path}: cannot be read as a PCD ({reason}); write it again.") from None
+
+
+def _append(file: BinaryIO, points: NDArray[np.float32]) -> int:
+    file.write(np.ascontiguousarray(points, "<f4").tobytes())
+    return len(points)
+
+
+def _pcd_header(count: int) -> bytes:
+    from pypcd4 import Encoding, MetaData
+
+    xyz = MetaData(
+        fields=("x", "y", "z"),
+        size=(4, 4, 4),
+        type=("F", "F", "F"),
+        count=(1, 1, 1),
+        points=count,
+        width=count,
+    )
+    return xyz.compose_header(Encoding.BINARY).encode()
+
+
+def _ply_header(count: int) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property float {axis}" for axis in "xyz"]
+    return "\n".join([*lines, "end_header", ""]).encode()
+
+
+_TILE_M = 40.0
+"""Edge of a tile, about: the ground is cut along x and y, and a tile holds whole voxels."""
+_KEPT = 2_000_000
+"""Points that are kept in memory before they go to their tiles."""
+_FARTHEST = 1e6
+"""m; points farther from the origin are no part of a map."""
+_POINT = np.dtype(("<f4", 3))
+
+Tile = tuple[int, int]
+
+
+class MapTiles:
+    """Takes clouds one by one and writes their map: in each voxel the mean of the points that fell into it.
+
+    Neither depends on the order of the tiles nor of the clouds, but for rounding.
+    """
+
+    def __init__(self, folder: Path, voxel: float) -> None:
+        """Begin an empty map.
+
+        Args:
+            folder: for the tiles; made here, and left to the caller to remove.
+            voxel: edge length, m, 1 mm or more.
+        """
+        folder.mkdir(parents=True)
+        self._folder = folder
+        self._voxel = voxel
+        self._across = max(1, round(_TILE_M / voxel))
+        self._waiting: dict[Tile, list[NDArray[np.float32]]] = defaultdict(list)
+        self._waiting_count = 0
+        self._tiles: set[Tile] = set()
+        self.taken = 0
+        """How many points the clouds had that are finite."""
+
+    def add(self, T_world_imu: NDArray[np.float64], points: NDArray[np.float32]) -> None:
+        """Add a cloud.
+
+        Args:
+            T_world_imu: (4, 4).
+            points: (n, 3) m, in the IMU frame; those that are not finite are left out.
+        """
+        world = points.astype(np.float64) @ T_world_imu[:3, :3].T + T_world_imu[:3, 3]
+        world = world[(np.abs(world) < _FARTHEST).all(axis=1)]
+        if not len(world):
+            return
+        self.taken += len(world)
+        tile = np.floor(world[:, :2] / self._voxel).astype(np.int64) // self._across
+        # from the tile's corner, where single precision is enough
+        world[:, :2] -= tile * (self._across * self._voxel)
+        local = world.astype(np.float32)
+        order = np.lexsort((tile[:, 1], tile[:, 0]))
+        tile, local = tile[order], local[order]
+        begins = np.flatnonzero(np.any(np.diff(tile, axis=0, prepend=tile[:1] - 1) != 0, axis=1))
+        for begin, part in zip(begins, np.split(local, begins[1:]), strict=True):
+            self._waiting[int(tile[begin, 0]), int(tile[begin, 1])].append(part)
+        self._waiting_count += len(local)
+        if self._waiting_count >= _KEPT:
+            self._put_aside()
+
+    def write(self, path: Path) -> int:
+        """Write the map, a PCD or PLY by the file's ending, and return how many points it has."""
+        self._put_aside()
+        tiles = sorted(self._tiles)
+        counts = [self._thin(tile) for tile in tiles]
+        write_cloud(path, self._thinned(tiles), sum(counts))
+        return sum(counts)
+
+    def _put_aside(self) -> None:
+        for tile, parts in self._waiting.items():
+            with self._path(tile).open("ab") as file:
+                file.write(np.concatenate(parts).tobytes())
+        self._tiles |= self._waiting.keys()
+        self._waiting.clear()
+        self._waiting_count = 0
+
+    def _thin(self, tile: Tile) -> int:
+        """Put world points, one per voxel, in place of a tile's; return how many there are."""
+        local = np.fromfile(self._path(tile), _POINT).astype(np.float64)
+        cell = np.floor(local / self._voxel).astype(np.int64)
+        # single precision may round onto the next tile's first voxel
+        cell[:, :2] = np.clip(cell[:, :2], 0, self._across - 1)
+        cell[:, 2] -= cell[:, 2].min()
+        key = (cell[:, 2] * self._across + cell[:, 1]) * self._across + cell[:, 0]
+        _, voxel, count = np.unique(key, return_inverse=True, return_counts=True)
+        sums = np.stack([np.bincount(voxel, axis) for axis in local.T], -1)
+        corner = np.array([*tile, 0]) * (self._across * self._voxel)
+        world = sums / count[:, None] + corner
+        self._path(tile).write_bytes(world.astype(np.float32).tobytes())
+        return len(count)
+
+    def _thinned(self, tiles: list[Tile]) -> Iterator[NDArray[np.float32]]:
+        for tile in tiles:
+            yield np.fromfile(self._path(tile), _POINT)
+
+    def _path(self, tile: Tile) -> Path:
+        return self._folder / f"{tile[0]}_{tile[1]}"
+
 
 SPOOL_SUFFIX = ".spool"
 _POINT_BYTES = 3 * np.dtype(np.float32).itemsize

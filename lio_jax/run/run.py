@@ -20,26 +20,21 @@ from lio_jax.data.imu_checks import cleaned
 from lio_jax.data.prefetch import prefetched
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.data.trajectory import Trajectory, write_kitti_poses, write_tum
-from lio_jax.loops.g2o import write_g2o
-from lio_jax.run.environment import environment
-from lio_jax.run.folder import write_json, write_text
+from lio_jax.pose_graph.g2o import write_g2o
+from lio_jax.run.fitted_settings import fitted_to_surroundings, with_sensor_sizes
+from lio_jax.run.folder import environment, write_json, write_text
 from lio_jax.run.global_correction import GlobalCorrection
-from lio_jax.run.imu_feed import OFFSET_MARGIN_S, ImuFeed
-from lio_jax.run.imu_rate import write_imu_rate
 from lio_jax.run.keyframes import keyframe_indices, odometry_edges
+from lio_jax.run.logs import Overflow, ScanLog, TrajectoryLog, write_imu_rate
 from lio_jax.run.map_file import MapFile
-from lio_jax.run.overflow import Overflow
-from lio_jax.run.scan_log import ScanLog
-from lio_jax.run.sensor_sizes import with_sensor_sizes
-from lio_jax.run.surroundings import fitted_to_surroundings
-from lio_jax.run.track import CompiledStep, Tracked, track
-from lio_jax.run.trajectory_log import TrajectoryLog
+from lio_jax.run.scan_inputs import OFFSET_MARGIN_S, ImuFeed
+from lio_jax.run.track import CompiledStep, ScanResult, track
 
 
 class Observer(Protocol):
     """Something that wants to see every scan's result: a recording, a progress bar."""
 
-    def __call__(self, tracked: Tracked, scan_ms: float) -> None:
+    def __call__(self, tracked: ScanResult, scan_ms: float) -> None:
         """Take one result; its arrays must not be kept."""
         ...
 
@@ -240,7 +235,7 @@ def check_start(sequence: Sequence, start: int) -> None:
         )
 
 
-def new_map_points(tracked: Tracked) -> NDArray[np.float32]:
+def new_map_points(tracked: ScanResult) -> NDArray[np.float32]:
     """Return the (n, 3) points a scan added to the map, m in world."""
     output = tracked.output
     points = np.asarray(output.points)[np.asarray(output.added)]
@@ -279,7 +274,7 @@ def _timed(scans: Iterator[LidarScan], decode_ms: list[float]) -> Iterator[Lidar
         yield scan
 
 
-def failure_record(number: int, tracked: Tracked) -> dict[str, Any]:
+def failure_record(number: int, tracked: ScanResult) -> dict[str, Any]:
     """Return what metrics.json says of a scan that failed; ``number``: in the recording."""
     message = f"scan {number}: {tracked.failure}"
     return {"scan": number, "stamp_ns": tracked.stamp_ns, "message": message}

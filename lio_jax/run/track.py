@@ -15,16 +15,15 @@ from lio_jax.core.config import Config
 from lio_jax.core.params import Params
 from lio_jax.core.settings import Settings
 from lio_jax.core.types import ImuBatch, Scan
+from lio_jax.core.xla import PerShape
 from lio_jax.data.sequence import LidarScan
 from lio_jax.recipes import recipe_named
-from lio_jax.run.compilation import PerShape
 from lio_jax.run.failures import Evidence, failure_of, longest_gap
-from lio_jax.run.feed import bucket_for, padded
-from lio_jax.run.imu_feed import ImuFeed
+from lio_jax.run.scan_inputs import ImuFeed, bucket_for, padded
 
 
 @dataclass(frozen=True)
-class Tracked:
+class ScanResult:
     """One scan's result on the host."""
 
     index: int
@@ -89,7 +88,7 @@ class CompiledStep:
     def restarted(self, state: Any, imu: Any) -> Any:
         """Return the state before the first scan, with the velocity that ``state`` found."""
         # no program of its own, which takes as long to compile as the first
-        return self._programs.recipe.moving_as(self.initial_state(imu), state)
+        return self._programs.recipe.with_velocity_of(self.initial_state(imu), state)
 
     def __call__(self, state: Any, scan: Any, imu: Any) -> tuple[Any, Any]:
         """Run one step; ``state`` is consumed."""
@@ -101,7 +100,7 @@ def track(
     scans: Iterable[LidarScan],
     imu: ImuFeed | None = None,
     step: CompiledStep | None = None,
-) -> Iterator[Tracked]:
+) -> Iterator[ScanResult]:
     """Yield the result of each scan in turn.
 
     Args:
@@ -111,23 +110,25 @@ def track(
         step: a compiled step of the same settings, to reuse its programs over several recordings.
     """
     step = step or CompiledStep(settings)
-    judged = Judged(settings)
+    judged = ResultBuilder(settings)
     compiled_s = step.compile_s
-    for fed, state, output in stepped(step, feed(settings, scans, imu)):
+    for fed, state, output in run_steps(step, scan_inputs(settings, scans, imu)):
         nav, result = jax.tree.map(np.array, (state.nav, output.registration))
         step_ms = (time.perf_counter() - fed.padded_at - (step.compile_s - compiled_s)) * 1e3
         compiled_s = step.compile_s
         yield judged(fed, nav, result, output, step_ms)
 
 
-class Judged:
+class ResultBuilder:
     """Puts each scan's result together with what went wrong with it."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._before: Evidence | None = None
 
-    def __call__(self, fed: "Fed", nav: Any, registration: Any, output: Any, step_ms: float) -> Tracked:
+    def __call__(
+        self, fed: "ScanInput", nav: Any, registration: Any, output: Any, step_ms: float
+    ) -> ScanResult:
         """Return the result of a scan; ``nav`` and ``registration`` have numpy leaves."""
         evidence = Evidence(
             points=fed.count,
@@ -141,7 +142,7 @@ class Judged:
         )
         failure = failure_of(evidence, self._before, self._settings)
         self._before = evidence
-        return Tracked(
+        return ScanResult(
             index=fed.index,
             stamp_ns=fed.end_ns,
             T_world_imu=pose_matrix(nav.T_world_imu.wxyz_xyz),
@@ -155,7 +156,7 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class Fed:
+class ScanInput:
     """One scan as a step takes it."""
 
     index: int
@@ -171,7 +172,7 @@ class Fed:
     """Host time, s."""
 
 
-def feed(settings: Settings, scans: Iterable[LidarScan], imu: ImuFeed | None) -> Iterator[Fed]:
+def scan_inputs(settings: Settings, scans: Iterable[LidarScan], imu: ImuFeed | None) -> Iterator[ScanInput]:
     """Yield each scan in padded arrays, with the inertial samples that cover it."""
     last_end_ns, last_count, size = None, 0, 0
     opened = False
@@ -186,7 +187,7 @@ def feed(settings: Settings, scans: Iterable[LidarScan], imu: ImuFeed | None) ->
         before = imu.before(scan) if imu and not opened else None
         opened = opened or count > 0
         done = time.perf_counter()
-        yield Fed(index, scan.end_ns, count, arrays, samples, before, (done - start) * 1e3, done)
+        yield ScanInput(index, scan.end_ns, count, arrays, samples, before, (done - start) * 1e3, done)
         last_end_ns, last_count = scan.end_ns, count
 
 
@@ -206,12 +207,12 @@ class Step(Protocol):
         ...
 
 
-def stepped(step: Step, feed: Iterable[Fed]) -> Iterator[tuple[Fed, Any, Any]]:
+def run_steps(step: Step, scan_inputs: Iterable[ScanInput]) -> Iterator[tuple[ScanInput, Any, Any]]:
     """Yield each scan with the state and the output after it; the state is consumed by the next one."""
     state: Any = None
-    first: Fed | None = None
+    first: ScanInput | None = None
     reopened = False
-    for fed in feed:
+    for fed in scan_inputs:
         if state is None or (fed.count and first is None):
             state = step.initial_state(fed.before)
         elif first is not None and fed.count and not reopened:
@@ -222,7 +223,7 @@ def stepped(step: Step, feed: Iterable[Fed]) -> Iterator[tuple[Fed, Any, Any]]:
         yield fed, state, output
 
 
-def _reopened(step: Step, state: Any, first: Fed, second: Fed) -> Any:
+def _reopened(step: Step, state: Any, first: ScanInput, second: ScanInput) -> Any:
     """Return the state after the first scan, compensated with the velocity that the second one shows.
 
     Only the second scan tells how fast a vehicle is moving from the start; until then the map holds the first

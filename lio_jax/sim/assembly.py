@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import ArrayLike, NDArray
 
-from lio_jax.sim.movers import Movers
 from lio_jax.sim.primitives import Boxes, Cylinders, Grounds, Planes, Spheres, TiltedBoxes
-from lio_jax.sim.worlds import Solids, World
+from lio_jax.sim.worlds import Movers, Solids, World
 
 Rows = NDArray[np.float64] | Sequence[Sequence[float | int]]
 """A table, one solid a row."""

@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from lio_jax.sim.assembly import Terrain, Traffic, assembled, draws
 from lio_jax.sim.blocks import HALF_STREET, LANE, LAP_BLOCKS, Sides, block_corners, block_sides, lap
-from lio_jax.sim.scene import Route, Scene
 from lio_jax.sim.traffic import Loop, car_boxes, traffic
+from lio_jax.sim.worlds import Route, Scene
 
 _BODY_HEIGHT = 1.6
 """Of the body frame above the ground, m."""

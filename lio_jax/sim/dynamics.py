@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from lio_jax.sim.scene import Dynamics
+from lio_jax.sim.worlds import Dynamics
 
 CHANNELS = ("forward", "left", "up", "roll", "pitch", "yaw")
 """Of the sway: offsets (m) along the heading, then turns (rad) about the body's axes."""

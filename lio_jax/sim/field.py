@@ -3,7 +3,7 @@
 import numpy as np
 
 from lio_jax.sim.assembly import Terrain, assembled, draws
-from lio_jax.sim.scene import Route, Scene
+from lio_jax.sim.worlds import Route, Scene
 
 _EXTENT = 110.0
 """Half the width of the field, m."""

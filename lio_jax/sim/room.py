@@ -3,7 +3,7 @@
 import numpy as np
 
 from lio_jax.sim.assembly import assembled, upright
-from lio_jax.sim.scene import Route, Scene
+from lio_jax.sim.worlds import Route, Scene
 
 SIZE = np.array([12.0, 8.0, 3.5])
 """Of the room, m; the builder's frame has its origin at the floor's centre."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve1d, minimum_filter1d
 
 from lio_jax.core.errors import UsageError
-from lio_jax.sim.scene import Route
+from lio_jax.sim.worlds import Route
 
 _KNOTS_PER_RADIUS = 5.0
 """Knots spent on a radius' length of a corner: the spline cuts the corner by 1 % of the radius."""

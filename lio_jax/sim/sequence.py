@@ -21,8 +21,7 @@ from lio_jax.sim.collision import STEP, TOGETHER, check_clear
 from lio_jax.sim.gps import GpsModel, simulate_gps
 from lio_jax.sim.imu import GRAVITY, ImuModel, ImuTruth, simulate_imu
 from lio_jax.sim.lidar import Lidar, Sweep, column_times, firing_times_ns, spinning_lidar, sweep
-from lio_jax.sim.livox_pattern import RosetteLidar
-from lio_jax.sim.sensors import Layout, find_sensor
+from lio_jax.sim.sensors import Layout, RosetteLidar, find_sensor
 from lio_jax.sim.trajectory import Motion, motion_along, motion_through, pose_at
 from lio_jax.sim.world_registry import build
 from lio_jax.sim.worlds import Counts, Part, World, counts_along, nearest_part

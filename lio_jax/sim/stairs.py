@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.sim.assembly import assembled, upright
-from lio_jax.sim.scene import Route, Scene
+from lio_jax.sim.worlds import Route, Scene
 
 _STOREYS = 3
 _STOREY = 3.4

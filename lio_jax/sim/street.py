@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from lio_jax.sim.assembly import assembled
 from lio_jax.sim.blocks import Sides, block_sides, lap
-from lio_jax.sim.scene import Route, Scene
+from lio_jax.sim.worlds import Route, Scene
 
 _BODY_HEIGHT = 1.5
 """Of the body frame above the ground at rest, m."""

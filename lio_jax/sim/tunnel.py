@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.sim.assembly import assembled, draws, upright
-from lio_jax.sim.scene import Route, Scene
+from lio_jax.sim.worlds import Route, Scene
 
 LENGTH = 560.0
 """From portal to portal, m; the builder's frame has the tunnel along +x from 0, its axis at y = 0."""

@@ -7,10 +7,10 @@ from lio_jax.sim.city import city
 from lio_jax.sim.field import field
 from lio_jax.sim.office import office
 from lio_jax.sim.room import room
-from lio_jax.sim.scene import Scene
 from lio_jax.sim.stairs import stairs
 from lio_jax.sim.street import street
 from lio_jax.sim.tunnel import tunnel
+from lio_jax.sim.worlds import Scene
 
 WORLDS: dict[str, Callable[[int], Scene]] = {
     "city": city,

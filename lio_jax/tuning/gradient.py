@@ -7,8 +7,7 @@ from lio_jax.core.settings import Settings, recipe_settings
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.run.run import settings_for
-from lio_jax.tuning.named_objectives import objective_named
-from lio_jax.tuning.objective import Objective
+from lio_jax.tuning.objectives import Objective, objective_named
 from lio_jax.tuning.parameters import free_parameters
 from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.streaming import StreamingGradient

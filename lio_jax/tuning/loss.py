@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.config import Config
-from lio_jax.tuning.objective import Objective
-from lio_jax.tuning.parameters import Free
+from lio_jax.tuning.objectives import Objective
+from lio_jax.tuning.parameters import ParameterVector
 from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.streaming import StreamingGradient
 
@@ -30,7 +30,7 @@ class Evaluated:
 class Loss:
     """Mean objective over recordings, weighted by their numbers of scans."""
 
-    def __init__(self, recipe: str, config: Config, free: Free, objective: Objective) -> None:
+    def __init__(self, recipe: str, config: Config, free: ParameterVector, objective: Objective) -> None:
         """Keep the programs; they are compiled on first use."""
         self._streaming = StreamingGradient(recipe, config, free, objective)
 

@@ -1,18 +1,89 @@
-"""Objectives with and without ground truth, over any recipe's steps."""
+"""Objectives over a recording: what one is, those with and without ground truth, and their names."""
 
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.types import state_dtype
+from lio_jax.core.params import Params
+from lio_jax.core.types import NavState, Scan, state_dtype
 from lio_jax.lidar.range_scatter import range_scatter
 from lio_jax.recipes.output import Evidence
 from lio_jax.registration.point_evidence import PointEvidence
-from lio_jax.tuning.objective import Objective, Observed, TruePose
+
+
+class TruePose(eqx.Module):
+    """Where the vehicle was at a scan's end."""
+
+    T_world_imu: jaxlie.SE3
+    known: Bool[Array, ""]
+    """False where there is no truth."""
+
+
+class Observed(eqx.Module):
+    """One scan, the parameters, and what its step leaves to see."""
+
+    nav: NavState
+    """At the scan's end."""
+    rmse: Float[Array, ""]
+    """Robustly weighted root mean square distance of the scan to the map, m."""
+    status: Int32[Array, ""]
+    """Of the solve, see :mod:`lio_jax.estimation.iterated_filter`."""
+    lost: Bool[Array, ""]
+    covariance: Float[Array, "24 24"] | None
+    """Of the navigation state; None from recipes that carry none."""
+    evidence: Evidence | None
+    """How well the scan was foretold; None from recipes that carry no covariance."""
+    log_evidence: Float[Array, ""] | None
+    """Of all measurements so far; None from recipes without a smoother."""
+    scan: Scan | None = None
+    """As it was fed to the step."""
+    params: Params | None = None
+    """The step's."""
+
+    @staticmethod
+    def of(state: Any, output: Any) -> "Observed":
+        """Return what a recipe's step leaves to see."""
+        result = output.registration
+        return Observed(
+            nav=state.nav,
+            rmse=result.rmse,
+            status=result.status,
+            lost=output.lost,
+            covariance=output.covariance,
+            evidence=output.evidence,
+            log_evidence=output.log_evidence,
+        )
+
+    def beside(self, scan: Scan, params: Params) -> "Observed":
+        """Return the same with what went into the step.
+
+        Not by :meth:`of`: a program that hands its arguments through has them copied.
+        """
+        return replace(self, scan=scan, params=params)
+
+
+class Objective(Protocol):
+    """A loss over a recording: lower is better. Its sums are a pytree of floating-point arrays."""
+
+    def start(self) -> Any:
+        """Return the sums before the first scan."""
+        ...
+
+    def add(self, sums: Any, seen: Observed, truth: TruePose) -> Any:
+        """Return the sums with one more scan."""
+        ...
+
+    def value(self, sums: Any) -> Float[Array, ""]:
+        """Return the loss."""
+        ...
+
 
 _CAUCHY = 0.6120031809624806
 """Where 2 z^2 / (z^2 + c^2) is one on average over a normal z."""
@@ -158,3 +229,125 @@ def _points(seen: Observed) -> PointEvidence:
     if points is None:
         raise UsageError("the recipe tells nothing of single points; use the objective pose.")
     return points
+
+
+class AbsoluteError(eqx.Module):
+    """Root mean square position error after the best rigid alignment, m.
+
+    Horn, "Closed-form solution of absolute orientation using unit quaternions", 1987; Umeyama 1991, from the
+    moments of the two point sets alone. At the best rotation the error's derivative by the rotation vanishes,
+    so the alignment is differentiable without differentiating the decomposition.
+    """
+
+    def start(self) -> Float[Array, "18"]:
+        """Return count, sums, products and squares."""
+        return jnp.zeros(18, state_dtype())
+
+    def add(self, sums: Float[Array, "18"], seen: Observed, truth: TruePose) -> Float[Array, "18"]:
+        """Add a pair of positions, where the truth is known."""
+        p, q = seen.nav.T_world_imu.translation(), truth.T_world_imu.translation()
+        products = (q[:, None] * p).ravel()
+        moments = jnp.concatenate([jnp.ones(1), p, q, products, (p @ p)[None], (q @ q)[None]])
+        return sums + jnp.where(truth.known, moments, 0.0)
+
+    def value(self, sums: Float[Array, "18"]) -> Float[Array, ""]:
+        """Return the error; 0 for fewer than two poses."""
+        count = jnp.maximum(sums[0], 1.0)
+        p, q = sums[1:4] / count, sums[4:7] / count
+        covariance = sums[7:16].reshape(3, 3) / count - q[:, None] * p
+        left, _, right = jnp.linalg.svd(jax.lax.stop_gradient(covariance))
+        flip = jnp.diag(jnp.ones(3).at[2].set(jnp.sign(jnp.linalg.det(left @ right))))
+        aligned = jnp.sum((left @ flip @ right) * covariance)
+        mean_square = sums[16] / count - p @ p + sums[17] / count - q @ q - 2 * aligned
+        return _root(mean_square)
+
+
+class RelativeError(eqx.Module):
+    """Root mean square error of the motion over a number of scans: m, or rad for the rotation."""
+
+    scans: int = eqx.field(static=True, default=10)
+    rotation: bool = eqx.field(static=True, default=False)
+
+    def start(self) -> tuple[Any, ...]:
+        """Return the last poses of both and whether they are known, the sum of squares and the count."""
+        poses = jnp.zeros((2, self.scans, 7), state_dtype()).at[:, :, 0].set(1.0)
+        return poses, jnp.zeros(self.scans, state_dtype()), jnp.zeros(2, state_dtype())
+
+    def add(self, sums: tuple[Any, ...], seen: Observed, truth: TruePose) -> tuple[Any, ...]:
+        """Compare the motion since ``scans`` scans ago with the true one."""
+        poses, known, total = sums
+        new = jnp.stack([seen.nav.T_world_imu.wxyz_xyz, truth.T_world_imu.wxyz_xyz])
+        moved, truly = (
+            jaxlie.SE3(old[0]).inverse() @ jaxlie.SE3(pose) for old, pose in zip(poses, new, strict=True)
+        )
+        error = truly.inverse() @ moved
+        off = error.rotation().log() if self.rotation else error.translation()
+        both = jnp.where(truth.known, known[0], 0.0)
+        total += jnp.stack([jnp.where(both > 0, off @ off, 0.0), both])
+        poses = jnp.concatenate([poses[:, 1:], new[:, None]], 1)
+        return poses, jnp.append(known[1:], jnp.where(truth.known, 1.0, 0.0)), total
+
+    def value(self, sums: tuple[Any, ...]) -> Float[Array, ""]:
+        """Return the error; 0 where no motion could be compared."""
+        total = sums[2]
+        return _root(total[0] / jnp.maximum(total[1], 1.0))
+
+
+def _root(square: Float[Array, ""]) -> Float[Array, ""]:
+    positive = square > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+
+
+@dataclass(frozen=True)
+class Named:
+    """An objective and what has to be known about it."""
+
+    objective: Objective
+    needs_truth: bool
+    likelihood: bool
+    """A mean negative log-likelihood per scan: its scores give the parameters' uncertainty."""
+
+
+_OPENING = 10
+"""Scans at a recording's start that tell of the first state's sigmas, not of the noise."""
+_SINGLE = {
+    "pose": Named(MeanOverScans(pose_innovation, _OPENING), False, True),
+    "point": Named(MeanOverScans(point_innovation, _OPENING), False, True),
+    "marginal": Named(MarginalLikelihood(_OPENING), False, True),
+    "ranges": Named(MeanOverScans(range_noise, _OPENING), False, True),
+    "map": Named(MeanOverScans(map_consistency), False, False),
+    "ate": Named(AbsoluteError(), True, False),
+    "rpe": Named(RelativeError(), True, False),
+    "rpe-rotation": Named(RelativeError(rotation=True), True, False),
+}
+_SHORT = {"noise": "pose+ranges"}
+"""What is called by a name of its own."""
+
+
+def objective_named(text: str) -> Named:
+    """Return an objective by name, or a sum such as ``ate+0.01*pose``.
+
+    Raises:
+        UsageError: a name is not known (lists those there are), or a weight is no number.
+    """
+    terms = _SHORT.get(text, text).split("+")
+    parts, weights = [], []
+    for term in terms:
+        weight, star, name = term.rpartition("*")
+        if name.strip() not in _SINGLE:
+            names = ", ".join([*_SINGLE, *_SHORT])
+            raise UsageError(
+                f"objective '{name.strip()}' is not known; there are: {names}, and sums like ate+0.01*pose."
+            )
+        try:
+            weights.append(float(weight) if star else 1.0)
+        except ValueError:
+            raise UsageError(f"objective '{term}': '{weight}' is no number to weigh {name} with.") from None
+        parts.append(_SINGLE[name.strip()])
+    if len(parts) == 1 and weights == [1.0]:
+        return parts[0]
+    return Named(
+        WeightedSum(tuple(part.objective for part in parts), tuple(weights)),
+        any(part.needs_truth for part in parts),
+        all(part.likelihood for part in parts) and set(weights) == {1.0},
+    )

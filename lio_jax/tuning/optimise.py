@@ -38,7 +38,7 @@ class Bounds(NamedTuple):
         return np.asarray(np.clip(x, self.lower, self.upper), np.float64)
 
 
-def scoring(evaluate: Evaluate, x: Vector, bounds: Bounds, iterations: int) -> None:
+def fisher_scoring(evaluate: Evaluate, x: Vector, bounds: Bounds, iterations: int) -> None:
     """Newton steps with the Fisher information from the scans' scores (Berndt, Hall, Hall & Hausman 1974).
 
     Only for likelihoods. Far from the solution the scores' spread overstates the curvature by orders of

@@ -19,7 +19,7 @@ _ROTATION = "extrinsics.rotation"
 _ADDED = ("extrinsics.translation", "extrinsics.time_offset")
 
 
-class Free(eqx.Module):
+class ParameterVector(eqx.Module):
     """Parameters as a function of a vector x of P numbers.
 
     A positive leaf is exp(x); translation and time offset are x; a rotation is its start times Exp(x), rad.
@@ -55,7 +55,7 @@ class Free(eqx.Module):
         return {f"params.{path}": np.asarray(_leaf(params, path)).tolist() for path in self.paths}
 
 
-def free_parameters(start: Params, patterns: tuple[str, ...] | list[str]) -> Free:
+def free_parameters(start: Params, patterns: tuple[str, ...] | list[str]) -> ParameterVector:
     """Return the parameters that the patterns name.
 
     Args:
@@ -89,7 +89,7 @@ def free_parameters(start: Params, patterns: tuple[str, ...] | list[str]) -> Fre
         chosen += [leaf for leaf in starting if leaf not in chosen]
     if not chosen:
         raise UsageError(f"no parameter to tune was named; {_choice()}")
-    return Free(start, tuple(chosen))
+    return ParameterVector(start, tuple(chosen))
 
 
 def _choice() -> str:

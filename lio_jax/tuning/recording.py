@@ -11,8 +11,8 @@ from lio_jax.core.types import state_dtype
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.run.run import check_start, imu_feed
-from lio_jax.run.track import Fed, feed
-from lio_jax.tuning.objective import TruePose
+from lio_jax.run.track import ScanInput, scan_inputs
+from lio_jax.tuning.objectives import TruePose
 
 
 class Recording:
@@ -44,7 +44,7 @@ class Recording:
         self.name = sequence.info.name
         samples, self.notes = imu_feed(sequence, settings)
         self._truth = truth if truth is not None else sequence.truth()
-        self._read = lambda: feed(settings, sequence.scans(start, count), samples)
+        self._read = lambda: scan_inputs(settings, sequence.scans(start, count), samples)
         self._kept = list(self._read()) if keep else None
         remaining = max(0, sequence.info.scan_count - start)
         self._count = len(self._kept) if self._kept else min(remaining, count or remaining)
@@ -57,7 +57,7 @@ class Recording:
         """Return whether any pose is known."""
         return self._truth is not None
 
-    def feed(self) -> Iterator[Fed]:
+    def scan_inputs(self) -> Iterator[ScanInput]:
         """Yield the scans."""
         return iter(self._kept) if self._kept is not None else self._read()
 

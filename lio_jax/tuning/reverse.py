@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from lio_jax.core.config import Config
 from lio_jax.core.types import ImuBatch, Scan
+from lio_jax.core.xla import PerShape
 from lio_jax.recipes import recipe_named
-from lio_jax.run.compilation import PerShape
-from lio_jax.run.track import stepped
-from lio_jax.tuning.objective import Objective, Observed, TruePose
-from lio_jax.tuning.parameters import Free
+from lio_jax.run.track import run_steps
+from lio_jax.tuning.objectives import Objective, Observed, TruePose
+from lio_jax.tuning.parameters import ParameterVector
 from lio_jax.tuning.recording import Recording
-from lio_jax.tuning.streaming import parted
+from lio_jax.tuning.streaming import split_smooth
 
 _KINDS = ("init", "restart", "step")
 _SHORTEST = 8
@@ -57,7 +57,7 @@ class _Numbered:
 class CheckpointedGradient:
     """Programs for one recipe, one set of free parameters and one objective; compiled on first use."""
 
-    def __init__(self, recipe: str, config: Config, free: Free, objective: Objective) -> None:
+    def __init__(self, recipe: str, config: Config, free: ParameterVector, objective: Objective) -> None:
         """Keep what shapes the programs."""
         module = recipe_named(recipe)
         self.objective = objective
@@ -66,7 +66,7 @@ class CheckpointedGradient:
             if kind == "init":
                 return module.init(config, free(x), imu), None
             if kind == "restart":
-                return module.moving_as(module.init(config, free(x), imu), state), None
+                return module.with_velocity_of(module.init(config, free(x), imu), state), None
             state, output = module.step(config, free(x), state, scan, imu)
             return state, Observed.of(state, output)
 
@@ -76,14 +76,14 @@ class CheckpointedGradient:
         def backward(
             kind: str, x: Array, state: Any, sums: Any, scan: Any, imu: Any, truth: Any, cotangent: Any
         ) -> tuple[Array, Any, Any]:
-            smooth, fixed = (None, None) if state is None else parted(state)
+            smooth, fixed = (None, None) if state is None else split_smooth(state)
 
             def smooth_part(x: Array, smooth: Any, sums: Any) -> tuple[Any, Any]:
                 old = None if state is None else eqx.combine(smooth, fixed)
                 new, seen = forward(kind, x, old, scan, imu)
                 if seen is not None and truth is not None:
                     sums = add(x, sums, seen, scan, truth)
-                return parted(new)[0], sums
+                return split_smooth(new)[0], sums
 
             _, pull = jax.vjp(smooth_part, x, smooth, sums)
             return pull(cotangent)
@@ -104,7 +104,7 @@ class CheckpointedGradient:
             every: steps between checkpoints, at least 8; None: the square root of their number.
         """
         tape = _Tape(self, jnp.asarray(x), max(every or math.isqrt(len(recording)), _SHORTEST))
-        for fed, state, seen in stepped(tape, recording.feed()):
+        for fed, state, seen in run_steps(tape, recording.scan_inputs()):
             tape.count(state, seen, fed.scan, recording.truth_at(fed.end_ns))
         return tape.unwound()
 
@@ -159,7 +159,7 @@ class _Tape:
                 one = self._operations[number]
                 bar = state_bar.pop(number, None)
                 if bar is None:
-                    bar = jax.tree.map(jnp.zeros_like, parted(states[number])[0])
+                    bar = jax.tree.map(jnp.zeros_like, split_smooth(states[number])[0])
                 fed = (one.sums, one.scan, one.imu, one.truth)
                 own_bar, source_bar, sums_bar = self._programs.backward[one.kind](
                     self._x, states[one.source], *fed, (bar, sums_bar)

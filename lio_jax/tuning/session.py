@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import atomic_path
 from lio_jax.tuning.loss import Evaluated, Loss
-from lio_jax.tuning.optimise import Bounds, adam, fisher_information, lbfgsb, scoring
-from lio_jax.tuning.parameters import Free
+from lio_jax.tuning.optimise import Bounds, adam, fisher_information, fisher_scoring, lbfgsb
+from lio_jax.tuning.parameters import ParameterVector
 from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.values import StreamingValues
 
@@ -56,7 +56,7 @@ class Session:
     def __init__(
         self,
         folder: Path,
-        free: Free,
+        free: ParameterVector,
         loss: Loss,
         values: StreamingValues,
         training: Listing[Recording],
@@ -109,7 +109,7 @@ class Session:
             return
         try:
             if optimiser == "scoring":
-                scoring(self.evaluate, start, bounds, left)
+                fisher_scoring(self.evaluate, start, bounds, left)
             elif optimiser == "lbfgsb":
                 lbfgsb(self.evaluate, start, bounds, left)
             else:
@@ -168,7 +168,7 @@ class Session:
             aside.write_text(json.dumps(held, indent=1) + "\n")
 
 
-def _read(path: Path, free: Free) -> list[Iterate]:
+def _read(path: Path, free: ParameterVector) -> list[Iterate]:
     held = json.loads(path.read_text())
     if tuple(held["names"]) != free.names:
         raise LioJaxError(

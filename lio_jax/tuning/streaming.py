@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from lio_jax.core.config import Config
 from lio_jax.core.types import ImuBatch, NavState, Scan
+from lio_jax.core.xla import PerShape
 from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, NOT_FINITE
 from lio_jax.recipes import recipe_named
-from lio_jax.run.compilation import PerShape
-from lio_jax.run.track import stepped
-from lio_jax.tuning.objective import Objective, Observed, TruePose
-from lio_jax.tuning.parameters import Free
+from lio_jax.run.track import run_steps
+from lio_jax.tuning.objectives import Objective, Observed, TruePose
+from lio_jax.tuning.parameters import ParameterVector
 from lio_jax.tuning.recording import Recording
 
 
@@ -31,7 +31,7 @@ class Gradient(NamedTuple):
 
     value: float
     gradient: NDArray[np.float64]
-    """(p,) by the vector of :class:`Free`."""
+    """(p,) by the vector of :class:`ParameterVector`."""
     scores: NDArray[np.float64]
     """(n, p) each scan's share of the gradient."""
     unconverged: tuple[int, ...]
@@ -52,7 +52,7 @@ class _Moving(NamedTuple):
 class StreamingGradient:
     """Programs for one recipe, one set of free parameters and one objective; compiled on first use."""
 
-    def __init__(self, recipe: str, config: Config, free: Free, objective: Objective) -> None:
+    def __init__(self, recipe: str, config: Config, free: ParameterVector, objective: Objective) -> None:
         """Keep what shapes the programs."""
         self.free = free
         self.objective = objective
@@ -66,7 +66,7 @@ class StreamingGradient:
         sums = self.objective.start()
         sums_dot = jax.tree.map(lambda leaf: jnp.zeros((len(x), *leaf.shape), leaf.dtype), sums)
         shares, unconverged = [], []
-        for fed, _, (seen, seen_dot) in stepped(self._steps.at(x), recording.feed()):
+        for fed, _, (seen, seen_dot) in run_steps(self._steps.at(x), recording.scan_inputs()):
             before = sums_dot
             truth = recording.truth_at(fed.end_ns)
             sums, sums_dot = self._add(x, sums, sums_dot, seen, seen_dot, fed.scan, truth)
@@ -87,36 +87,36 @@ class StreamingGradient:
             return self.objective.add(sums, seen, truth), None
 
         tangents = jnp.eye(len(x), dtype=x.dtype), sums_dot, seen_dot
-        sums, _, sums_dot = pushed(add, (x, sums, smooth), tangents)
+        sums, _, sums_dot = push_forward(add, (x, sums, smooth), tangents)
         return sums, sums_dot
 
     def _value_with_tangents(self, sums: Any, dots: Any) -> tuple[Array, Array]:
-        value, _, slopes = pushed(lambda sums: (self.objective.value(sums), None), (sums,), (dots,))
+        value, _, slopes = push_forward(lambda sums: (self.objective.value(sums), None), (sums,), (dots,))
         return value, slopes
 
 
 class _TangentSteps:
     """A recipe's programs with tangents."""
 
-    def __init__(self, recipe: str, config: Config, free: Free) -> None:
+    def __init__(self, recipe: str, config: Config, free: ParameterVector) -> None:
         module = recipe_named(recipe)
 
         def first(x: Array, imu: ImuBatch | None) -> _Moving:
             def start(x: Array) -> tuple[Any, Any]:
-                return parted(module.init(config, free(x), imu))
+                return split_smooth(module.init(config, free(x), imu))
 
-            return _moving(pushed(start, (x,), (jnp.eye(len(x), dtype=x.dtype),)))
+            return _moving(push_forward(start, (x,), (jnp.eye(len(x), dtype=x.dtype),)))
 
         def step(x: Array, moving: _Moving, scan: Scan, imu: ImuBatch | None) -> tuple[_Moving, Any]:
-            smooth, fixed = parted(moving.state)
+            smooth, fixed = split_smooth(moving.state)
 
             def forward(x: Array, smooth: Any) -> tuple[Any, Any]:
                 state, output = module.step(config, free(x), eqx.combine(smooth, fixed), scan, imu)
-                smooth, rest = parted(state)
+                smooth, rest = split_smooth(state)
                 seen, unseen = eqx.partition(Observed.of(state, output), eqx.is_inexact_array)
                 return (smooth, seen), (rest, unseen)
 
-            (smooth, seen), (rest, unseen), (dot, seen_dot) = pushed(
+            (smooth, seen), (rest, unseen), (dot, seen_dot) = push_forward(
                 forward, (x, smooth), (jnp.eye(len(x), dtype=x.dtype), moving.dot)
             )
             return _Moving(eqx.combine(smooth, rest), dot), (eqx.combine(seen, unseen), seen_dot)
@@ -140,14 +140,16 @@ class _StepAt:
         return self._programs.init(self._x, imu)
 
     def restarted(self, state: _Moving, imu: ImuBatch | None) -> _Moving:
-        fresh, exchanged = self.initial_state(imu), self._programs.recipe.moving_as
+        fresh, exchanged = self.initial_state(imu), self._programs.recipe.with_velocity_of
         return _Moving(exchanged(fresh.state, state.state), exchanged(fresh.dot, state.dot))
 
     def __call__(self, state: _Moving, scan: Scan, imu: ImuBatch | None) -> tuple[_Moving, Any]:
         return self._programs.step(self._x, state, scan, imu)
 
 
-def pushed(function: Callable[..., tuple[Any, Any]], primals: tuple, tangents: tuple) -> tuple[Any, Any, Any]:
+def push_forward(
+    function: Callable[..., tuple[Any, Any]], primals: tuple, tangents: tuple
+) -> tuple[Any, Any, Any]:
     """Return ``function(*primals)``, a pair (value, rest), and the value's P derivatives.
 
     Args:
@@ -163,7 +165,7 @@ def pushed(function: Callable[..., tuple[Any, Any]], primals: tuple, tangents: t
     return jax.vmap(along, out_axes=(None, None, 0))(*tangents)
 
 
-def parted(state: Any) -> tuple[Any, Any]:
+def split_smooth(state: Any) -> tuple[Any, Any]:
     """Return what is smooth in a state, and the map and all that is counted or chosen."""
     outside = eqx.tree_at(lambda tree: tree.map, jax.tree.map(eqx.is_inexact_array, state), False)
     return eqx.partition(state, outside)

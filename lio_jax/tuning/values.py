@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 
 from lio_jax.core.config import Config
 from lio_jax.core.types import Scan
+from lio_jax.core.xla import PerShape
 from lio_jax.recipes import recipe_named
-from lio_jax.run.compilation import PerShape
-from lio_jax.run.track import stepped
-from lio_jax.tuning.objective import Objective, Observed, TruePose
-from lio_jax.tuning.parameters import Free
+from lio_jax.run.track import run_steps
+from lio_jax.tuning.objectives import Objective, Observed, TruePose
+from lio_jax.tuning.parameters import ParameterVector
 from lio_jax.tuning.recording import Recording
 
 
 class StreamingValues:
     """An objective at several vectors of parameters at once: one program, batched over them."""
 
-    def __init__(self, recipe: str, config: Config, free: Free, objective: Objective) -> None:
+    def __init__(self, recipe: str, config: Config, free: ParameterVector, objective: Objective) -> None:
         """Keep what shapes the programs."""
         module = recipe_named(recipe)
         self._objective = objective
@@ -34,7 +34,7 @@ class StreamingValues:
             return objective.add(sums, seen.beside(scan, free(x)), truth)
 
         self.init = PerShape(jax.jit(jax.vmap(lambda x, imu: module.init(config, free(x), imu), (0, None))))
-        self.exchanged = module.moving_as
+        self.exchanged = module.with_velocity_of
         self.step = PerShape(jax.jit(jax.vmap(one, (0, 0, None, None)), donate_argnums=1))
         self._add = PerShape(jax.jit(jax.vmap(add, (0, 0, 0, None, None))))
         self._value = PerShape(jax.jit(jax.vmap(objective.value)))
@@ -45,7 +45,7 @@ class StreamingValues:
         sums = jax.tree.map(
             lambda leaf: jnp.broadcast_to(leaf, (len(x), *leaf.shape)), self._objective.start()
         )
-        for fed, _, seen in stepped(_Batch(self, x), recording.feed()):
+        for fed, _, seen in run_steps(_Batch(self, x), recording.scan_inputs()):
             sums = self._add(x, sums, seen, fed.scan, recording.truth_at(fed.end_ns))
         return np.asarray(self._value(sums))
 

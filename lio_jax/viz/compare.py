@@ -13,8 +13,7 @@ from lio_jax.viz.html import bullets, figure, figures, page, paragraph, section,
 from lio_jax.viz.report import headline
 from lio_jax.viz.run_figures import relative_error_groups, way_of
 from lio_jax.viz.run_record import RunRecord, read_run
-from lio_jax.viz.svg import Line, box_chart, empty, line_chart, plan_chart
-from lio_jax.viz.svg_axes import equal_axes
+from lio_jax.viz.svg import Line, box_chart, empty, equal_axes, line_chart, plan_chart
 
 
 def write_comparison(folders: Sequence[Path], out: Path) -> None:

@@ -1,9 +1,9 @@
-"""Trajectory and timing pictures as PNG, drawn without pyplot: no global state, no display, a fast import."""
+"""Plots by matplotlib: trajectories, times, tunings and Allan deviations."""
 
 from collections.abc import Mapping
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,7 @@ from lio_jax.core.files import atomic_path
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.evaluation.alignment import align, position_errors
 from lio_jax.evaluation.association import match_by_time
+from lio_jax.imu.allan import NoiseFit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -174,3 +175,101 @@ def _label(axes: "Axes", x: str, y: str, title: str) -> None:
     axes.grid(True, alpha=0.3)
     axes.ticklabel_format(useOffset=False)
     axes.legend(loc="best", fontsize="small")
+
+
+def plot_tuning(
+    path_png: Path,
+    losses: Mapping[str, NDArray[np.float64]],
+    parameters: Mapping[str, NDArray[np.float64]],
+    intervals: Mapping[str, tuple[float, float]],
+    best: int,
+) -> None:
+    """Draw the losses and, one panel each, the parameters over the evaluations.
+
+    Args:
+        path_png: file to write, whole or not at all.
+        losses: (n,) by name.
+        parameters: (n,) values by name; positive ones are drawn on a log scale.
+        intervals: 95 % interval of the best value by name, where it is known.
+        best: which evaluation was taken.
+    """
+    panels = 1 + len(parameters)
+    columns = min(3, panels)
+    rows = -(-panels // columns)
+    figure = _figure(4.2 * columns, 3.0 * rows)
+    axes = np.ravel(figure.subplots(rows, columns, squeeze=False))
+    for name, values in losses.items():
+        axes[0].plot(values, ".-", label=name)
+    axes[0].set_title("loss", fontsize="medium")
+    axes[0].legend(fontsize="small")
+    for panel, (name, values) in zip(axes[1:], parameters.items(), strict=False):
+        panel.plot(values, ".-", color="tab:blue")
+        if np.all(values > 0):
+            panel.set_yscale("log")
+        if name in intervals:
+            low, high = intervals[name]
+            panel.axhspan(low, high, color="tab:blue", alpha=0.15, label="95 % interval")
+            panel.legend(fontsize="small")
+        panel.set_title(name, fontsize="medium")
+    for panel in axes[:panels]:
+        panel.axvline(best, color="k", linewidth=0.8, linestyle=":")
+        panel.set_xlabel("evaluation")
+        panel.grid(True, which="both", alpha=0.25)
+    for panel in axes[panels:]:
+        panel.set_axis_off()
+    _save(figure, path_png)
+
+
+class Noise(Protocol):
+    """What is drawn of one sensor."""
+
+    @property
+    def tau(self) -> NDArray[np.float64]:
+        """(k,) averaging times, s."""
+        ...
+
+    @property
+    def deviation(self) -> NDArray[np.float64]:
+        """(k, 3) Allan deviation of the axes."""
+        ...
+
+    @property
+    def combined(self) -> NoiseFit:
+        """Fit to the axes' mean variance."""
+        ...
+
+
+def plot_allan(path_png: Path, noises: Mapping[str, Noise], title: str) -> None:
+    """Draw each sensor's Allan deviation, the fit and the two densities where they are read.
+
+    Args:
+        path_png: file to write, whole or not at all.
+        noises: by name and unit.
+        title: shown above.
+    """
+    figure = _figure(6.0 * len(noises), 5.0)
+    figure.suptitle(title)
+    for axes, (name, noise) in zip(np.ravel(figure.subplots(1, len(noises))), noises.items(), strict=True):
+        fit = noise.combined
+        for axis, colour in enumerate(("tab:red", "tab:green", "tab:blue")):
+            axes.loglog(
+                noise.tau, noise.deviation[:, axis], ".-", color=colour, label="xyz"[axis], markersize=3
+            )
+        low, high = float(np.nanmin(noise.deviation)), float(np.nanmax(noise.deviation))
+        span = np.geomspace(min(noise.tau[0], 1.0), max(noise.tau[-1], 3.0), 200)
+        axes.loglog(span, fit.deviation(span), "k-", linewidth=2.0, label="fit, axes combined", alpha=0.7)
+        white = f"white noise {fit.white:.2e}/sqrt(Hz)"
+        axes.loglog(span, fit.white / np.sqrt(span), "k:", label=white)
+        axes.plot(1.0, fit.white, "ko", markersize=5)
+        if fit.walk is not None:
+            walk = f"bias random walk {fit.walk:.2e}/s/sqrt(Hz)"
+            axes.loglog(span, fit.walk * np.sqrt(span / 3), "k--", label=walk)
+            axes.plot(3.0, fit.walk, "ks", markersize=5)
+            low = min(low, fit.walk)
+        axes.set_ylim(low / 2, high * 2)
+        axes.set_xlabel("averaging time [s]")
+        axes.set_ylabel("Allan deviation")
+        axes.set_title(name, fontsize="medium")
+        axes.grid(True, which="both", alpha=0.25)
+        axes.legend(loc="best", fontsize="small")
+    _save(figure, path_png)

@@ -1,9 +1,4 @@
-"""Write a run as a rerun recording (.rrd): the one place that knows rerun's API.
-
-Nothing is sent anywhere unless a viewer's address is given: else the stream has a file as its only sink. It
-starts no viewer and no server, and is never made rerun's global recording. (rerun collects usage data in its
-viewer and command line, not in its library.)
-"""
+"""The one place that speaks to rerun: recordings and the layout of its viewer."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,11 +11,73 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import atomic_path
-from lio_jax.viz.blueprint import ADDED, RAW, default_blueprint
-from lio_jax.viz.colour import colour_by_height
 
 if TYPE_CHECKING:
     import rerun as rr
+    import rerun.blueprint as rrb
+
+
+# Blue to yellow in even steps of lightness, so that the order survives colour blindness and grey print.
+_ANCHORS = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], np.float64)
+
+
+def _packed_table(size: int) -> NDArray[np.uint32]:
+    where = np.linspace(0.0, len(_ANCHORS) - 1.0, size)
+    channels = [np.interp(where, np.arange(len(_ANCHORS)), column).round() for column in _ANCHORS.T]
+    red, green, blue = (channel.astype(np.uint32) for channel in channels)
+    return (red << 24) | (green << 16) | (blue << 8) | np.uint32(255)
+
+
+_TABLE = _packed_table(256)
+
+
+def colour_by_height(height: NDArray[np.floating], low: float, high: float) -> NDArray[np.uint32]:
+    """Return (n,) packed 0xRRGGBBAA colours, from dark blue at ``low`` m to yellow at ``high`` m."""
+    share = (height - low) / max(high - low, 1e-6)
+    return _TABLE[np.clip(share * (len(_TABLE) - 1), 0, len(_TABLE) - 1).astype(np.int64)]
+
+
+RAW, ADDED = "world/lidar/raw", "world/added"
+"""Entities that are there to be turned on: they lie over the compensated scan and over the map."""
+PLOTS = {
+    "match": "metrics/match",
+    "state": "metrics/state",
+    "times": "metrics/times",
+}
+"""Views of scalars by name."""
+
+
+def default_blueprint() -> "rrb.Blueprint":
+    """Return the layout of a run."""
+    import rerun.blueprint as rrb
+
+    hidden = rrb.EntityBehavior(visible=False)
+    world = rrb.Spatial3DView(origin="world", name="world", overrides={RAW: hidden, ADDED: hidden})
+    plots = [
+        rrb.TimeSeriesView(origin=f"{origin}/{group}", name=title)
+        for origin, group, title in (
+            (PLOTS["match"], "residual_m", "residual [m]"),
+            (PLOTS["match"], "points", "points matched"),
+            (PLOTS["match"], "nis", "NIS"),
+            (PLOTS["state"], "gyro_bias", "gyroscope bias and sigma [rad/s]"),
+            (PLOTS["state"], "accel_bias", "accelerometer bias and sigma [m/s^2]"),
+            (PLOTS["times"], "", "times [ms]"),
+        )
+    ]
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            world,
+            rrb.Tabs(
+                rrb.Vertical(*plots[:3], name="match"),
+                rrb.Vertical(*plots[3:5], name="biases"),
+                rrb.Vertical(plots[5], name="times"),
+            ),
+            column_shares=[3, 1],
+        ),
+        rrb.TimePanel(timeline="scan", state="collapsed"),
+        collapse_panels=True,
+    )
+
 
 _MAX_SCAN_POINTS = 5_000
 _MIN_SCAN_POINTS = 1_000

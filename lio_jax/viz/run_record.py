@@ -1,4 +1,4 @@
-"""Read back what a run left in its folder, for reports."""
+"""Read a run folder back."""
 
 import json
 from dataclasses import dataclass, field, replace
@@ -13,8 +13,51 @@ from lio_jax.core.errors import LioJaxError
 from lio_jax.data.trajectory import Trajectory, read_tum
 from lio_jax.evaluation.alignment import Alignment, align
 from lio_jax.evaluation.association import MatchedTrajectories, match_by_time
-from lio_jax.run.cloud_file import read_cloud
-from lio_jax.viz.correction_record import CorrectionRecord, read_correction
+from lio_jax.run.keyframes import read_keyframes
+from lio_jax.run.map_file import read_cloud
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectionRecord:
+    """The corrected trajectory, and the loops between keyframes."""
+
+    trajectory: Trajectory
+    """T_world_imu at the scans' ends."""
+    keyframes: NDArray[np.float64]
+    """(k, 3) m, positions in world."""
+    loops: list[dict[str, Any]]
+    """As in loops.json."""
+
+    def strips(self, closed: bool) -> NDArray[np.float64]:
+        """Return (n, 2, 3) m, the ends of the loops that are closed, or of those that were refused.
+
+        Of the latter a keyframe's first alone: it may have been compared with many others.
+        """
+        chosen: dict[Any, tuple[int, int]] = {}
+        for number, loop in enumerate(self.loops):
+            trusted = loop["weight"] is not None and loop["weight"] > 0.5
+            if trusted == closed:
+                chosen.setdefault(number if closed else loop["source"], (loop["source"], loop["target"]))
+        ends = np.array(list(chosen.values()), np.int64).reshape(-1, 2)
+        return self.keyframes[ends]
+
+
+def read_correction(folder: Path) -> CorrectionRecord | None:
+    """Read what the back end left; None in a run without one.
+
+    Raises:
+        LioJaxError: a file is damaged.
+    """
+    if not (folder / "odometry.tum").is_file():
+        return None
+    path = folder / "loops.json"
+    try:
+        loops = json.loads(path.read_text())["loops"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise LioJaxError(f"{path}: cannot be read ({error}); run again.") from None
+    keyframes = read_keyframes(folder).T_world_imu[:, :3, 3]
+    return CorrectionRecord(read_tum(folder / "trajectory.tum"), keyframes, loops)
+
 
 _NEEDED = ("states.npz", "metrics.json", "config.yaml")
 

@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.error_state import ACCEL_BIAS, GYRO_BIAS, POSITION
-from lio_jax.run.directions import weak_directions
+from lio_jax.run.failures import weak_directions
 from lio_jax.run.run import new_map_points
-from lio_jax.run.track import Tracked, pose_matrix
+from lio_jax.run.track import ScanResult, pose_matrix
 from lio_jax.viz.recording import Recording
 
 _POINTS = 5000
@@ -18,7 +18,7 @@ class RecordingObserver:
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
 
-    def __call__(self, tracked: Tracked, scan_ms: float) -> None:
+    def __call__(self, tracked: ScanResult, scan_ms: float) -> None:
         """Log one scan's result."""
         recording, index, stamp_ns = self._recording, tracked.index, tracked.stamp_ns
         T_world_lidar = tracked.T_world_imu @ pose_matrix(tracked.nav.T_imu_lidar.wxyz_xyz)
@@ -37,7 +37,7 @@ class RecordingObserver:
 
 
 def _compensated(
-    tracked: Tracked, T_world_lidar: NDArray[np.float64]
+    tracked: ScanResult, T_world_lidar: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
     """Return the compensated scan in the lidar frame, and which points are corners where that is known."""
     output = tracked.output
@@ -49,7 +49,7 @@ def _compensated(
     return in_lidar, None if output.corners is None else np.asarray(output.corners)[kept]
 
 
-def _match(tracked: Tracked) -> dict[str, NDArray[np.float64]]:
+def _match(tracked: ScanResult) -> dict[str, NDArray[np.float64]]:
     found = tracked.output.registration
     values = {
         "match/residual_m": np.asarray(found.rmse, np.float64),
@@ -61,7 +61,7 @@ def _match(tracked: Tracked) -> dict[str, NDArray[np.float64]]:
     return values
 
 
-def _biases(tracked: Tracked) -> dict[str, NDArray[np.float64]]:
+def _biases(tracked: ScanResult) -> dict[str, NDArray[np.float64]]:
     """Return speed, biases and their sigmas."""
     nav, covariance = tracked.nav, tracked.output.covariance
     values = {"state/speed": np.asarray(np.linalg.norm(nav.velocity))}
@@ -76,7 +76,7 @@ def _biases(tracked: Tracked) -> dict[str, NDArray[np.float64]]:
     return values
 
 
-def _unobserved(tracked: Tracked, T_world_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
+def _unobserved(tracked: ScanResult, T_world_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (k, 3) open directions in the lidar frame: of the position, or the axis of a turn."""
     found = tracked.output.registration
     # the first scan has nothing to be matched with

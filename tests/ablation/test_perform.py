@@ -9,16 +9,15 @@ import pytest
 
 from lio_jax.ablation import perform as performing
 from lio_jax.ablation.batch import BatchPrograms, run_batch
-from lio_jax.ablation.metric_names import METRICS, is_timing
 from lio_jax.ablation.perform import perform
 from lio_jax.ablation.results import gathered
-from lio_jax.ablation.spec import load_spec
+from lio_jax.ablation.spec import METRICS, is_timing, load_spec
 from lio_jax.ablation.store import DiskError, opened
 from lio_jax.ablation.tasks import tasks_of
 from lio_jax.commands.runtime import prepare_jax
 from lio_jax.core.errors import LioJaxError
 from lio_jax.run.run import imu_feed, settings_for
-from lio_jax.run.track import CompiledStep, Programs, feed, track
+from lio_jax.run.track import CompiledStep, Programs, scan_inputs, track
 from tests.ablation.drives import DRIVE, SMALL, write_spec
 from tests.full_disk import full_disk_after
 
@@ -52,7 +51,7 @@ STANDING = {**DRIVE, "beams": 16, "columns": 512}
 
 def in_double_precision(settings, scans, imu):
     """Feed points in double precision: in single precision a micrometre is lost at 16 m already."""
-    for fed in feed(settings, scans, imu):
+    for fed in scan_inputs(settings, scans, imu):
         wide = {name: np.asarray(getattr(fed.scan, name), np.float64) for name in ("points", "time")}
         ends = {name: np.float64(getattr(fed.scan, name)) for name in ("duration", "interval")}
         yield replace(fed, scan=replace(fed.scan, **wide, **ends))

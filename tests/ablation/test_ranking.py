@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_1samp, wilcoxon
 
-from lio_jax.ablation.pictures import pareto_front
 from lio_jax.ablation.ranking import holm, ranking
+from lio_jax.ablation.report import pareto_front
 
 SEEDS = range(5)
 WORLDS = ("a", "b")

@@ -314,7 +314,7 @@ def test_faults_in_the_messages_of_a_bag(run, tmp_path):
 
 
 def test_output_on_a_full_or_forbidden_disk(folder, cli, tmp_path, monkeypatch):
-    from lio_jax.run import trajectory_log
+    from lio_jax.run import logs as trajectory_log
 
     def refuse(file, **arrays):
         raise OSError(28, "No space left on device", str(file))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.config import DataConfig
-from lio_jax.data.open import open_sequence
+from lio_jax.data.detect import open_sequence
 from lio_jax.data.trajectory import read_tum
 
 SCANS = 4

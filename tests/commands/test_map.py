@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from lio_jax.run.cloud_file import read_cloud, write_cloud
-from lio_jax.run.keyframe_store import KeyframeWriter
+from lio_jax.run.keyframes import KeyframeWriter
+from lio_jax.run.map_file import read_cloud, write_cloud
 from tests.run.clouds import read_ply
 
 RNG = np.random.default_rng(0)

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from lio_jax.commands import sim as command
 from lio_jax.commands.sim_options import ErrorOptions, MotionOptions, SensorOptions
 from lio_jax.core.config import DataConfig
+from lio_jax.data.detect import open_sequence
 from lio_jax.data.native import NativeSequence
-from lio_jax.data.open import open_sequence
 from lio_jax.data.trajectory import read_tum, write_kitti_poses
 from tests.commands.conftest import PLAIN
 from tests.full_disk import full_disk_after

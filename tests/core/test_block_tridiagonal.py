@@ -5,7 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.block_tridiagonal import BlockTridiagonal, factorise, inverse_blocks, log_determinant, solve
+from lio_jax.estimation.block_tridiagonal import (
+    BlockTridiagonal,
+    factorise,
+    inverse_blocks,
+    log_determinant,
+    solve,
+)
 
 COUNT, SIZE = 6, 4
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lio_jax.core.blocks import from_blocks
+from lio_jax.core.geometry import from_blocks
 
 
 def test_blocks_stand_where_they_were_put_and_add_up() -> None:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.implicit import Problem, Solution, implicit, known
+from lio_jax.core.implicit import Problem, Solution, implicit, with_derivative_of
 
 
 def solve(inputs):
@@ -88,7 +88,9 @@ def test_low_rank_directions_give_the_same_derivative():
 
 
 def test_a_known_value_takes_the_derivative_of_its_formula():
-    value, slope = jax.value_and_grad(lambda x: known(jnp.array(7.0), jnp.sin, x))(jnp.array(0.3))
+    value, slope = jax.value_and_grad(lambda x: with_derivative_of(jnp.array(7.0), jnp.sin, x))(
+        jnp.array(0.3)
+    )
     assert float(value) == 7.0
     assert float(slope) == pytest.approx(np.cos(0.3))
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.rotation import rotation_matrix, skew
+from lio_jax.core.geometry import rotation_matrix, skew
 
 
 def test_skew_is_the_cross_product() -> None:

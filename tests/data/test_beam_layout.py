@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.errors import UsageError
-from lio_jax.data.beam_layout import check_beams, elevation_levels
+from lio_jax.data.reconstruct import check_beams, elevation_levels
 
 LAYOUTS = {
     "VLP-16": np.arange(-15.0, 15.1, 2.0),

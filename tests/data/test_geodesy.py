@@ -2,8 +2,7 @@ import math
 
 import numpy as np
 
-from lio_jax.data.enu import geodetic_to_enu
-from lio_jax.data.geodesy import mercator_positions
+from lio_jax.data.enu import geodetic_to_enu, mercator_positions
 
 
 def test_positions_are_the_devkits() -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lio_jax.data.gps_messages import GpsCollector
+from lio_jax.data.navigation_messages import GpsCollector
 from tests.data import bags
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lio_jax.data.imu_messages import ImuCollector
+from lio_jax.data.navigation_messages import ImuCollector
 from tests.data import bags
 
 

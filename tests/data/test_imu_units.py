@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.config import DataConfig
-from lio_jax.data.imu_units import accel_scale
+from lio_jax.data.imu_checks import accel_scale
 
 CONFIG = DataConfig()
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lio_jax.data.livox import TYPES, decode_custom_msg, keep_by_tag
+from lio_jax.data.pointcloud2 import LIVOX_TYPES, decode_custom_msg, keep_by_tag
 from tests.data import bags
 
 SEEN = bags.sweep(columns=20)
@@ -28,7 +28,7 @@ def _raw(message: Any, ros2: bool, order: str = "<") -> bytes:
 @pytest.mark.parametrize("ros2", [False, True])
 @pytest.mark.parametrize("kind", bags.LIVOX)
 def test_equals_the_generic_decoder(kind: str, ros2: bool, order: str) -> None:
-    assert kind in TYPES
+    assert kind in LIVOX_TYPES
     raw = _raw(bags.custom_message(bags.START_NS, _cloud(), ros2, kind), ros2, order)
     types = bags.store(ros2)
     oracle = types.deserialize_cdr(raw, kind) if ros2 else types.deserialize_ros1(raw, kind)

@@ -2,7 +2,7 @@ from itertools import permutations
 
 import pytest
 
-from lio_jax.data.order import Stamped, ascending, in_time_order
+from lio_jax.data.time_order import Stamped, ascending, in_time_order
 
 HOUR = 36_000
 """In tenths of a second, as all times here."""

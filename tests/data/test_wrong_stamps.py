@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lio_jax.core.config import DataConfig
+from lio_jax.data.detect import open_sequence
 from lio_jax.data.native_writer import write_native
-from lio_jax.data.open import open_sequence
 from tests.data import bags
 from tests.data.bag_recordings import SEEN, received, scan_starts
 from tests.data.test_kitti import write_sequence

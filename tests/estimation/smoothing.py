@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from lio_jax.estimation.chain import Chain
-from lio_jax.estimation.evidence import log_evidence
+from lio_jax.estimation.marginal_likelihood import log_evidence
 from lio_jax.estimation.motion_state import MotionState
 from lio_jax.estimation.smoother import Smoothed, smooth
 from tests.experiments import bench_path  # noqa: F401

@@ -15,8 +15,8 @@ from lio_jax.core.error_state import (
     GRAVITY,
     ROTATION,
     TIME_OFFSET,
-    Swept,
-    Uncertain,
+    NavEstimate,
+    SweptState,
     local,
     retract,
 )
@@ -46,18 +46,18 @@ def test_the_reset_is_the_derivative_of_the_change_of_tangent_space(scale) -> No
 
 @partial(jax.jit, static_argnums=3)
 def update_by_pose(
-    prior: Uncertain, T_world_lidar: jaxlie.SE3, information: jax.Array, iterations: int
+    prior: NavEstimate, T_world_lidar: jaxlie.SE3, information: jax.Array, iterations: int
 ) -> Update:
     def measure(nav: NavState) -> Measurement:
         return measured_pose(nav, T_world_lidar, information)
 
-    return update_nav(Swept.at_once(prior), measure, max_iterations=iterations, **TOLERANCES)[0]
+    return update_nav(SweptState.at_once(prior), measure, max_iterations=iterations, **TOLERANCES)[0]
 
 
 @pytest.fixture(scope="module")
-def observation() -> tuple[Uncertain, jaxlie.SE3, jax.Array]:
+def observation() -> tuple[NavEstimate, jaxlie.SE3, jax.Array]:
     nav = random_nav(3)
-    prior = Uncertain(nav, random_covariance(4, 0.3))
+    prior = NavEstimate(nav, random_covariance(4, 0.3))
     root = np.linalg.cholesky(np.asarray(prior.covariance))
     truth = jax.jit(retract)(nav, jnp.asarray(root @ np.random.default_rng(5).normal(size=DOF)))
     root = np.random.default_rng(6).normal(size=(6, 6))
@@ -94,7 +94,7 @@ def test_frozen_parts_stay_put_to_the_last_bit(observation) -> None:
     free = jnp.ones(DOF)
     for part in (GRAVITY, EXTRINSIC_ROTATION, EXTRINSIC_TRANSLATION, TIME_OFFSET):
         free = free.at[part].set(0.0)
-    state = Uncertain(prior.nav, prior.covariance * free * free[:, None])
+    state = NavEstimate(prior.nav, prior.covariance * free * free[:, None])
     for _ in range(5):
         result = update_by_pose(state, T_world_lidar, information, 60)
         for name in ("gravity", "T_imu_lidar", "time_offset"):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 
-from lio_jax.core.error_state import DOF, Swept, Uncertain, local, retract
+from lio_jax.core.error_state import DOF, NavEstimate, SweptState, local, retract
 from lio_jax.core.params import ImuParams
 from lio_jax.core.types import ImuBatch, NavState
 from lio_jax.estimation.iterated_filter import Update
@@ -106,7 +106,7 @@ def run(key: jax.Array, sigma: jax.Array, true: Truth) -> tuple[jax.Array, Updat
     time = STEP * (jnp.arange(PER_SCAN + 2 * MARGIN + 1) - MARGIN)
     end = jnp.array(PER_SCAN * STEP)
 
-    def step(state: Uncertain, scan: jax.Array) -> tuple:
+    def step(state: NavEstimate, scan: jax.Array) -> tuple:
         chosen = jax.lax.dynamic_slice_in_dim(signal, scan * PER_SCAN, len(time))
         batch = ImuBatch(time, chosen[:, :3], chosen[:, 3:], jnp.ones(len(time), bool))
         predicted, _ = propagate(state, batch, IMU, jnp.zeros(()), end)
@@ -119,7 +119,7 @@ def run(key: jax.Array, sigma: jax.Array, true: Truth) -> tuple[jax.Array, Updat
             turned, T.translation() - turned @ pose_noise[scan, 3:]
         )
         update, _ = update_nav(
-            Swept.at_once(predicted),
+            SweptState.at_once(predicted),
             lambda trial: measured_pose(trial, measured, information),
             max_iterations=10,
             rotation_tolerance=jnp.array(1e-6),
@@ -127,5 +127,5 @@ def run(key: jax.Array, sigma: jax.Array, true: Truth) -> tuple[jax.Array, Updat
         )
         return update.state, (local(update.state.nav, nav), update)
 
-    _, (errors, updates) = jax.lax.scan(step, Uncertain(guess, jnp.diag(sigma**2)), jnp.arange(scans))
+    _, (errors, updates) = jax.lax.scan(step, NavEstimate(guess, jnp.diag(sigma**2)), jnp.arange(scans))
     return errors, updates

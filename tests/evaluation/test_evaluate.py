@@ -6,8 +6,7 @@ import pytest
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data.trajectory import Trajectory, write_kitti_poses, write_tum
-from lio_jax.evaluation.evaluate import evaluate, evaluate_files
-from lio_jax.evaluation.report import format_evaluation
+from lio_jax.evaluation.evaluate import evaluate, evaluate_files, format_evaluation
 from tests.evaluation.scenes import EPOCH_NS, PERIOD_NS, stamped, straight_drive, transform, winding_drive
 from tests.shared_data import SHARED_DATA, needs_shared
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.error_state import BIASES, POSITION, ROTATION, VELOCITY, Uncertain
+from lio_jax.core.error_state import BIASES, POSITION, ROTATION, VELOCITY, NavEstimate
 from lio_jax.core.params import ImuParams
 from lio_jax.core.types import ImuBatch, NavState
-from lio_jax.estimation.evidence import log_evidence as evidence_of_chain
+from lio_jax.estimation.marginal_likelihood import log_evidence as evidence_of_chain
 from lio_jax.estimation.motion_state import MotionState
 from lio_jax.estimation.smoother import smooth
 from lio_jax.imu.sampling import sample_intervals
@@ -87,8 +87,8 @@ def test_the_lag_is_the_filters():
     root = np.zeros((24, 24))
     root[:15, :15] = rng.normal(size=(15, 15))
     nav = nav_of(start)
-    swept, _ = propagate_sweep(Uncertain(nav, jnp.asarray(root @ root.T)), imu, IMU, *span, jnp.zeros(()))
-    still, _ = propagate_sweep(Uncertain(nav, jnp.zeros((24, 24))), imu, IMU, *span, jnp.zeros(()))
+    swept, _ = propagate_sweep(NavEstimate(nav, jnp.asarray(root @ root.T)), imu, IMU, *span, jnp.zeros(()))
+    still, _ = propagate_sweep(NavEstimate(nav, jnp.zeros((24, 24))), imu, IMU, *span, jnp.zeros(()))
     lag = slice(24, 30)
     expected = np.asarray(swept.covariance - still.covariance)[lag, lag]
     np.testing.assert_allclose(by_start @ (root @ root.T)[:15, :15] @ by_start.T, expected, atol=1e-9)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.error_state import ACCEL_BIAS, DOF, GYRO_BIAS, Uncertain, local, retract
+from lio_jax.core.error_state import ACCEL_BIAS, DOF, GYRO_BIAS, NavEstimate, local, retract
 from lio_jax.core.params import default_params
 from lio_jax.core.types import ImuBatch
 from lio_jax.imu.strapdown import path_along, propagate
@@ -31,9 +31,9 @@ step = quick_jit(propagate)
 follow = quick_jit(path_along)
 
 
-def state(time: float, covariance: np.ndarray | None = None) -> Uncertain:
+def state(time: float, covariance: np.ndarray | None = None) -> NavEstimate:
     matrix = np.zeros((DOF, DOF)) if covariance is None else covariance
-    return Uncertain(nav_at(time, OFFSET), jnp.asarray(matrix))
+    return NavEstimate(nav_at(time, OFFSET), jnp.asarray(matrix))
 
 
 @quick_jit
@@ -86,7 +86,7 @@ def test_the_transition_at_rest_is_finite_and_right(imu: ImuBatch) -> None:
         accel=jnp.broadcast_to(nav.accel_bias, imu.accel.shape),
     )
     phi = np.asarray(transition(nav, rest))
-    moved, _ = step(Uncertain(nav, jnp.eye(DOF)), rest, NOISELESS, START, END)
+    moved, _ = step(NavEstimate(nav, jnp.eye(DOF)), rest, NOISELESS, START, END)
     np.testing.assert_allclose(moved.covariance, phi @ phi.T, atol=1e-12)
 
 
@@ -106,7 +106,7 @@ def test_the_transition_of_the_time_offset_is_a_finite_difference(imu: ImuBatch,
     speed = (high[1] - low[1]) / (2 * h)
     begun = np.zeros((DOF, DOF))
     begun[23, 23] = 1.0
-    moved, _ = step(Uncertain(nav, jnp.asarray(begun)), noisy, NOISELESS, START, END)
+    moved, _ = step(NavEstimate(nav, jnp.asarray(begun)), noisy, NOISELESS, START, END)
     rotation = moved.nav.T_world_imu.rotation()
     np.testing.assert_allclose(rotation @ phi[6:9], speed, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(moved.covariance[:9, 23], phi, atol=1e-12)

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.error_state import DOF, LAG, POSITION, ROTATION, Uncertain, retract
+from lio_jax.core.error_state import DOF, LAG, POSITION, ROTATION, NavEstimate, retract
 from lio_jax.core.params import default_params
 from lio_jax.imu.path import pose_at
 from lio_jax.imu.strapdown import path_along, propagate_sweep
-from lio_jax.imu.sweep_lag import still_to_show
+from lio_jax.imu.sweep_mean_error import still_to_show
 from tests.imu.motion import ideal_imu, nav_at, quick_jit
 
 PARAMS = default_params().imu
@@ -61,7 +61,7 @@ def test_errors_at_the_start_lag_as_they_do_in_the_mean_of_perturbed_motions(swe
     expected = np.asarray(by_start(sweep_start))
     # the rows of a covariance whose one entry is a single component's are its columns of the transition
     for place in range(DOF):
-        begun = Uncertain(NAV, jnp.zeros((DOF, DOF)).at[place, place].set(1.0))
+        begun = NavEstimate(NAV, jnp.zeros((DOF, DOF)).at[place, place].set(1.0))
         covariance = np.asarray(swept(begun, IMU, NOISELESS, START, END, sweep_start)[0].covariance)
         want = np.outer(expected[:, place], expected[:, place])
         np.testing.assert_allclose(covariance[LAG, LAG], want, atol=0.03 * want.max() + 1e-9)
@@ -70,7 +70,7 @@ def test_errors_at_the_start_lag_as_they_do_in_the_mean_of_perturbed_motions(swe
 @pytest.mark.parametrize("sweep_start", SWEEPS)
 def test_white_noise_lags_as_in_the_mean_of_perturbed_motions(sweep_start):
     quiet = dataclasses.replace(NOISELESS, gyro_noise=PARAMS.gyro_noise, accel_noise=PARAMS.accel_noise)
-    begun = Uncertain(NAV, jnp.zeros((DOF, DOF)))
+    begun = NavEstimate(NAV, jnp.zeros((DOF, DOF)))
     covariance = np.asarray(swept(begun, IMU, quiet, START, END, sweep_start)[0].covariance)[LAG, LAG]
     effect = np.asarray(by_samples(sweep_start))
     sigma = np.repeat(np.array([PARAMS.gyro_noise, PARAMS.accel_noise]) / np.sqrt(STEP), 3)
@@ -81,14 +81,14 @@ def test_white_noise_lags_as_in_the_mean_of_perturbed_motions(sweep_start):
 
 
 def test_a_sweep_of_no_duration_does_not_lag():
-    begun = Uncertain(NAV, 0.01 * jnp.eye(DOF))
+    begun = NavEstimate(NAV, 0.01 * jnp.eye(DOF))
     covariance = np.asarray(swept(begun, IMU, PARAMS, START, END, END)[0].covariance)
     np.testing.assert_array_equal(covariance[LAG], 0)
     np.testing.assert_array_equal(covariance[:, LAG], 0)
 
 
 def test_a_constant_velocity_error_lags_by_half_the_sweep():
-    begun = Uncertain(NAV, jnp.zeros((DOF, DOF)).at[6:9, 6:9].set(jnp.eye(3)))
+    begun = NavEstimate(NAV, jnp.zeros((DOF, DOF)).at[6:9, 6:9].set(jnp.eye(3)))
     found = np.asarray(swept(begun, IMU, NOISELESS, START, END, jnp.asarray(0.0))[0].covariance)
     np.testing.assert_allclose(np.diag(found[LAG, LAG]), [0, 0, 0, *3 * [0.05**2]], atol=1e-12)
     np.testing.assert_allclose(np.diag(found[POSITION, LAG][:, 3:]), 3 * [0.05 * 0.113], atol=1e-12)

@@ -11,9 +11,9 @@ from lio_jax.core.config import Config, DataConfig, FeaturesConfig, LidarConfig
 from lio_jax.core.param_values import DEFAULTS
 from lio_jax.core.params import Params, params_from_values
 from lio_jax.core.types import Scan
-from lio_jax.data.open import open_sequence
+from lio_jax.data.detect import open_sequence
 from lio_jax.data.sequence import LidarScan
-from lio_jax.run.feed import padded
+from lio_jax.run.scan_inputs import padded
 from tests.shared_data import SHARED_DATA
 
 RECORDINGS = {

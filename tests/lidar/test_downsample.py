@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
-from lio_jax.lidar.downsample import Selection, select_per_voxel
+from lio_jax.lidar.thinning import Selection, select_per_voxel
 
 SELECT = jax.jit(select_per_voxel, static_argnums=3)
 

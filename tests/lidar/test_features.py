@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from lio_jax.lidar.features import lio_sam_features, lio_sam_rings, loam_features, loam_rings
-from lio_jax.run.feed import padded
+from lio_jax.run.scan_inputs import padded
 from tests.lidar.ring_scans import (
     LIO_SAM_PARAMS,
     LOAM_PARAMS,

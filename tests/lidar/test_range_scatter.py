@@ -14,9 +14,8 @@ from lio_jax.core.config import LidarConfig
 from lio_jax.core.params import default_params
 from lio_jax.core.types import Scan, initial_nav_state
 from lio_jax.lidar.range_scatter import range_scatter
-from lio_jax.run.feed import padded
-from lio_jax.tuning.objective import Observed, TruePose
-from lio_jax.tuning.objectives import _CAUCHY, _SHARPNESS, range_noise
+from lio_jax.run.scan_inputs import padded
+from lio_jax.tuning.objectives import _CAUCHY, _SHARPNESS, Observed, TruePose, range_noise
 from tests.lidar.ring_scans import on_device, real_scans
 from tests.shared_data import needs_shared
 

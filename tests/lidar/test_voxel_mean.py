@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.lidar.voxel_mean import mean_per_voxel
+from lio_jax.lidar.thinning import mean_per_voxel
 
 _mean = jax.jit(mean_per_voxel, static_argnums=3)
 VOXEL = 0.5

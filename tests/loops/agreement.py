@@ -4,8 +4,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from lio_jax.loops.host_poses import rotation_matrices, translations
-from lio_jax.loops.pose_graph import marginal_covariances
+from lio_jax.pose_graph.graph import rotation_matrices, translations
+from lio_jax.pose_graph.pose_graph import marginal_covariances
 from tests.loops.graphs import gtsam_graph, gtsam_optimum, gtsam_values
 
 

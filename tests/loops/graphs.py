@@ -5,8 +5,16 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from lio_jax.loops.graph import LOOP, ODOMETRY, POSITION, PRIOR, PoseGraph
-from lio_jax.loops.host_poses import numbers_of, rotation_matrices, translations
+from lio_jax.pose_graph.graph import (
+    LOOP,
+    ODOMETRY,
+    POSITION,
+    PRIOR,
+    PoseGraph,
+    numbers_of,
+    rotation_matrices,
+    translations,
+)
 
 
 def walk(group, count, rng, step=1.0, turn=0.3):

@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.settings import Settings
-from lio_jax.loops.back_end import BackEnd
-from lio_jax.loops.drift_correction import corrected_poses, levelled_onto
+from lio_jax.loops.back_end import BackEnd, corrected_poses, levelled_onto
 from lio_jax.loops.gps import GpsGate
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.loops.proposals import Proposal

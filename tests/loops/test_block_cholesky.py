@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from lio_jax.loops.block_cholesky import factorise, order_of, plan_of, solve
-from lio_jax.loops.elimination_tree import elimination_tree
-from lio_jax.loops.multifrontal import NotPositiveDefiniteError
+from lio_jax.pose_graph.block_cholesky import factorise, order_of, plan_of, solve
+from lio_jax.pose_graph.elimination_tree import elimination_tree
+from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError
 
 CHAIN = [(k + 1, k) for k in range(59)]
 GRAPHS = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.param_values import DEFAULTS
-from lio_jax.loops.drift import metres_from, possible_error
+from lio_jax.loops.proposals import metres_from, possible_error
 
 LIMITS = DEFAULTS["loop"]
 

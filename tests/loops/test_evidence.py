@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lio_jax.loops.evidence import Agreement, conflict, fitness_of
+from lio_jax.loops.overlap import Agreement, conflict, fitness_of
 from tests.loops.places import pose
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.errors import LioJaxError, UsageError
-from lio_jax.loops.external_pairs import keyframe_at, read_pairs
+from lio_jax.loops.proposals import keyframe_at, read_pairs
 from tests.loops.places import keyframe, pose
 
 

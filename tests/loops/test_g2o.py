@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.loops.g2o import Edge, write_g2o
+from lio_jax.pose_graph.g2o import Edge, write_g2o
 from tests.shared_data import SHARED_DATA, needs_shared
 
 

@@ -5,11 +5,9 @@ import numpy as np
 import pytest
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.loops.g2o import write_graph
-from lio_jax.loops.g2o_reader import read_g2o
-from lio_jax.loops.graph import LOOP, ODOMETRY
-from lio_jax.loops.host_poses import numbers_of
-from lio_jax.loops.pose_graph import solve
+from lio_jax.pose_graph.g2o import read_g2o, write_graph
+from lio_jax.pose_graph.graph import LOOP, ODOMETRY, numbers_of
+from lio_jax.pose_graph.pose_graph import solve
 from tests.shared_data import SHARED_DATA, needs_shared
 
 SPACE = "1 2 3 0 0 0 1"

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from lio_jax.loops.gps_alignment import alignment
+from lio_jax.loops.gps import alignment
 from tests.loops.drives import SHIFT, YAW, drive, to_enu
 
 LOOSE = 10.0

@@ -4,10 +4,9 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.loops.graduated import truncated_weights
-from lio_jax.loops.graph import LOOP
-from lio_jax.loops.host_poses import translations
-from lio_jax.loops.pose_graph import Robust, solve
+from lio_jax.pose_graph.graduated import truncated_weights
+from lio_jax.pose_graph.graph import LOOP, translations
+from lio_jax.pose_graph.pose_graph import Robust, solve
 from tests.loops.graphs import at, graph_of, walk, with_edges
 
 COUNT, LOOPS = 60, 24

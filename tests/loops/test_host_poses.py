@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.loops.host_poses import nearest_rotations
+from lio_jax.pose_graph.graph import nearest_rotations
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3, 0.3, 3.0])

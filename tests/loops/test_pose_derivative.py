@@ -7,10 +7,9 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.loops.graph import POSITION
-from lio_jax.loops.host_poses import translations
-from lio_jax.loops.pose_derivative import solved_poses
-from lio_jax.loops.pose_graph import Limits, solve
+from lio_jax.pose_graph.graph import POSITION, translations
+from lio_jax.pose_graph.pose_derivative import solved_poses
+from lio_jax.pose_graph.pose_graph import Limits, solve
 from tests.loops.graphs import graph_of, walk, with_edges, with_poses
 
 STEP = 1e-5

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.loops.chordal import chordal_poses, edges_at
-from lio_jax.loops.factors import linearise, residuals
-from lio_jax.loops.g2o_reader import read_g2o
-from lio_jax.loops.graph import LOOP, POSITION, moved
-from lio_jax.loops.host_poses import numbers_of, translations
-from lio_jax.loops.normal_equations import point_after
-from lio_jax.loops.pose_graph import Limits, compile_for, marginal_covariances, solve
-from lio_jax.loops.structure import structure_of
+from lio_jax.pose_graph.chordal import chordal_poses, edges_at
+from lio_jax.pose_graph.descent import point_after
+from lio_jax.pose_graph.factors import linearise, residuals
+from lio_jax.pose_graph.g2o import read_g2o
+from lio_jax.pose_graph.graph import LOOP, POSITION, moved, numbers_of, translations
+from lio_jax.pose_graph.pose_graph import Limits, compile_for, marginal_covariances, solve
+from lio_jax.pose_graph.structure import structure_of
 from tests.loops.agreement import agrees_on_covariances, agrees_with_gtsam
 from tests.loops.graphs import (
     at,

@@ -6,15 +6,13 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.loops.chordal import edges_at
-from lio_jax.loops.descent import Equations
-from lio_jax.loops.graduated import Robust
-from lio_jax.loops.graph import LOOP, ODOMETRY
-from lio_jax.loops.host_poses import numbers_of
-from lio_jax.loops.normal_equations import padded, padded_weights, point_after
-from lio_jax.loops.pose_derivative import solved_poses
-from lio_jax.loops.pose_graph import solve
-from lio_jax.loops.structure import structure_of
+from lio_jax.pose_graph.chordal import edges_at
+from lio_jax.pose_graph.descent import Equations, padded, padded_weights, point_after
+from lio_jax.pose_graph.graduated import Robust
+from lio_jax.pose_graph.graph import LOOP, ODOMETRY, numbers_of
+from lio_jax.pose_graph.pose_derivative import solved_poses
+from lio_jax.pose_graph.pose_graph import solve
+from lio_jax.pose_graph.structure import structure_of
 from tests.loops.agreement import agrees_on_covariances
 from tests.loops.graphs import (
     at,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lio_jax.loops.surroundings import level_points, padded, thinned
+from lio_jax.loops.keyframe import level_points, padded, thinned
 from tests.loops.places import keyframe, pillars, pose, seen_from
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from lio_jax.core.error_state import POSITION, ROTATION, VELOCITY, Uncertain
+from lio_jax.core.error_state import POSITION, ROTATION, VELOCITY, NavEstimate
 from lio_jax.core.params import default_params
 from lio_jax.core.types import Scan
 from lio_jax.imu.discretise import UNKNOWN_ACCEL, UNKNOWN_RATE
@@ -48,17 +48,17 @@ def moved(seconds: float) -> np.ndarray:
     return np.asarray(POSE.as_matrix()) @ expm(seconds * twist)
 
 
-def start() -> Uncertain:
+def start() -> NavEstimate:
     """A state that is known exactly."""
     begun = unlevelled_start(PARAMS)
     nav = dataclasses.replace(begun.nav, T_world_imu=POSE, velocity=POSE.rotation() @ jnp.asarray(SPEED))
-    return Uncertain(nav, jnp.zeros_like(begun.covariance))
+    return NavEstimate(nav, jnp.zeros_like(begun.covariance))
 
 
 _predicted = jax.jit(predicted_without_samples)
 
 
-def predict(item: Scan) -> Uncertain:
+def predict(item: Scan) -> NavEstimate:
     return _predicted(PARAMS, start(), jnp.asarray(RATE), item, jnp.array(False))[0]
 
 
@@ -84,7 +84,7 @@ def test_the_unknown_motion_is_white():
 
 def test_an_error_of_the_tilt_is_no_acceleration():
     begun = start()
-    tilted = Uncertain(begun.nav, begun.covariance.at[ROTATION, ROTATION].set(0.01 * jnp.eye(3)))
+    tilted = NavEstimate(begun.nav, begun.covariance.at[ROTATION, ROTATION].set(0.01 * jnp.eye(3)))
     prior, _ = _predicted(PARAMS, tilted, jnp.zeros(3), scan(), jnp.array(False))
     covariance = np.asarray(prior.covariance)
     # by gravity it would be 1 m/s^2 for 0.1 rad, 0.1 m/s after the interval

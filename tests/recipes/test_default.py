@@ -104,7 +104,7 @@ def test_first_scan_defines_the_world(drive):
 
 def test_a_restart_with_the_velocity_takes_the_distortion_out_of_the_first_scan(drive):
     """The world's origin is then where the vehicle was at the first scan's end, the map true at once."""
-    state, steps = default.moving_as(default.init(CONFIG, PARAMS), drive[3].state), []
+    state, steps = default.with_velocity_of(default.init(CONFIG, PARAMS), drive[3].state), []
     assert leaves_equal(state.map, initial().map)
     for number in range(6):
         state, output = STEP(PARAMS, state, scan(number))

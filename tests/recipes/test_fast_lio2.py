@@ -17,8 +17,7 @@ from lio_jax.core.params import Params
 from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.recipes import fast_lio2, recipe_named
 from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES
-from lio_jax.run.feed import padded
-from lio_jax.run.imu_feed import ImuFeed
+from lio_jax.run.scan_inputs import ImuFeed, padded
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
 
@@ -205,11 +204,11 @@ def test_one_map_point_per_voxel_and_the_map_is_of_the_street(drive):
 
 def test_a_restart_keeps_the_velocity_and_begins_anew(without, drive):
     for (states, _, _), inertial in ((without, False), (drive, True)):
-        state = fast_lio2.moving_as(INIT(settings_with().params(), arrays(inertial)[1]), states[-1])
+        state = fast_lio2.with_velocity_of(INIT(settings_with().params(), arrays(inertial)[1]), states[-1])
         assert state.scans == 0
         np.testing.assert_allclose(state.nav.T_world_imu.translation(), 0)
         assert not np.isfinite(np.asarray(state.map.off_centre)).any()
-    again = fast_lio2.moving_as(INIT(settings_with().params(), None), without[0][-1])
+    again = fast_lio2.with_velocity_of(INIT(settings_with().params(), None), without[0][-1])
     np.testing.assert_allclose(again.nav.velocity, without[0][-1].nav.velocity)
 
 

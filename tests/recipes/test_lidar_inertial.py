@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from lio_jax.core.error_state import EXTRINSIC_ROTATION, EXTRINSIC_TRANSLATION, TIME_OFFSET
 from lio_jax.core.settings import Settings, with_extrinsics, with_overrides
 from lio_jax.evaluation.consistency import nees
-from lio_jax.run.imu_feed import OFFSET_MARGIN_S, ImuFeed
+from lio_jax.run.fitted_settings import NEAR_VALUES
 from lio_jax.run.run import settings_for
-from lio_jax.run.surroundings import NEAR_VALUES
-from lio_jax.run.track import CompiledStep, Tracked, pose_matrix, track
+from lio_jax.run.scan_inputs import OFFSET_MARGIN_S, ImuFeed
+from lio_jax.run.track import CompiledStep, ScanResult, pose_matrix, track
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
 
@@ -51,7 +51,7 @@ def recording(world: str, seconds: float, moving_start: bool = False):
 class Drive:
     """Estimates and truth at the scans' ends."""
 
-    tracked: list[Tracked]
+    tracked: list[ScanResult]
     poses: np.ndarray
     truth: np.ndarray
 
@@ -149,7 +149,7 @@ def wrong(T: np.ndarray) -> np.ndarray:
     return T
 
 
-def extrinsic_error(item: Tracked, T: np.ndarray) -> tuple[float, float]:
+def extrinsic_error(item: ScanResult, T: np.ndarray) -> tuple[float, float]:
     """Return degrees and metres between an estimated and the true T_imu_lidar."""
     found = pose_matrix(item.nav.T_imu_lidar.wxyz_xyz)
     turn = Rotation.from_matrix(T[:3, :3].T @ found[:3, :3]).magnitude()

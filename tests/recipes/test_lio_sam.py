@@ -20,12 +20,11 @@ from lio_jax.core.param_values import DEFAULTS
 from lio_jax.core.params import Params
 from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.core.types import ImuBatch
+from lio_jax.core.xla import PerShape
 from lio_jax.recipes import lio_sam, recipe_named
 from lio_jax.recipes.smoothed_odometry import match_as_measurement
 from lio_jax.registration.feature_map import empty_feature_map
-from lio_jax.run.compilation import PerShape
-from lio_jax.run.feed import padded
-from lio_jax.run.imu_feed import ImuFeed
+from lio_jax.run.scan_inputs import ImuFeed, padded
 from tests.recipes.test_fast_lio2 import ate, recording, truth
 
 SMALL = [
@@ -327,7 +326,7 @@ def test_a_recipe_without_sizes_says_where_they_come_from():
 
 def test_a_restart_keeps_the_velocity_and_begins_anew(drive):
     states, _, _ = drive
-    fresh = lio_sam.moving_as(INIT(PARAMS, arrays()[1]), states[-1])
+    fresh = lio_sam.with_velocity_of(INIT(PARAMS, arrays()[1]), states[-1])
     velocity = states[-1].nav.velocity
     np.testing.assert_array_equal(fresh.nav.velocity, velocity)
     np.testing.assert_array_equal(fresh.window.latest().velocity, velocity)

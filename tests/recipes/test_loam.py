@@ -16,11 +16,11 @@ from lio_jax.core.errors import UsageError
 from lio_jax.core.param_values import DEFAULTS
 from lio_jax.core.params import Params
 from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
+from lio_jax.core.xla import PerShape
 from lio_jax.recipes import loam, recipe_named
 from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES
-from lio_jax.run.compilation import PerShape
-from lio_jax.run.feed import padded
 from lio_jax.run.run import settings_for
+from lio_jax.run.scan_inputs import padded
 from lio_jax.sim.sequence import SimulatedSequence
 from tests.recipes.test_fast_lio2 import ate, recording, truth
 
@@ -221,7 +221,7 @@ def test_a_recipe_without_sizes_says_where_they_come_from():
 
 
 def test_a_restart_keeps_the_velocity_and_begins_anew(drive):
-    state = loam.moving_as(loam.init(CONFIG, PARAMS), drive[0][-1])
+    state = loam.with_velocity_of(loam.init(CONFIG, PARAMS), drive[0][-1])
     assert state.scans == 0
     np.testing.assert_array_equal(state.twist, drive[0][-1].twist)
     assert not np.isfinite(np.asarray(state.map.cubes.surface.off_centre)).any()

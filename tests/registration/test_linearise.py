@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.mapping.voxel_map import anchor_of, empty_map, insert
 from lio_jax.registration.gauss_newton import NormalEquations
-from lio_jax.registration.scan_to_map import Frame, associate, linearise
+from lio_jax.registration.voxel_plane_icp import Frame, associate, linearise
 from tests.registration.scenes import map_of, matrix, params_with, pose
 
 VOXEL, SIGMA = 1.2, 0.05

@@ -21,7 +21,7 @@ from lio_jax.registration.lines_and_planes import (
     lines_near,
     no_lines_and_planes,
 )
-from lio_jax.registration.scan_to_map import Frame
+from lio_jax.registration.voxel_plane_icp import Frame
 from tests.mapping.test_point_map import held
 from tests.registration.test_knn_planes import columns
 
@@ -284,7 +284,7 @@ def test_five_neighbours_of_real_scans_are_those_of_a_k_d_tree():
     from pathlib import Path
 
     from lio_jax.core.config import DataConfig
-    from lio_jax.data.open import open_sequence
+    from lio_jax.data.detect import open_sequence
     from lio_jax.mapping.nearest_points import nearest_points
 
     folder = Path(__file__).resolve().parents[2].parent / "shared/data/kitti_odometry/sequences/04"

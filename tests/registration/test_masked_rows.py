@@ -8,7 +8,7 @@ import pytest
 
 from lio_jax.mapping.voxel_map import anchor_of
 from lio_jax.registration.gauss_newton import NormalEquations
-from lio_jax.registration.scan_to_map import Frame, associate, linearise
+from lio_jax.registration.voxel_plane_icp import Frame, associate, linearise
 from tests.registration.scenes import ROOM, map_of, params_with, pose, sample, seen_from
 
 PARAMS = params_with()

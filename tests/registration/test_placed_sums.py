@@ -6,7 +6,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.registration.placed_sums import placed_sums
+from lio_jax.registration.point_sums import point_sums
 
 COUNT = 60
 RNG = np.random.default_rng(5)
@@ -33,7 +33,7 @@ def written_out(vector, points):
 
 def summed(vector, points):
     total = jax.lax.stop_gradient(written_out(vector, points))
-    return placed_sums(total, rows, *arguments(vector, points), LEVELS)
+    return point_sums(total, rows, *arguments(vector, points), LEVELS)
 
 
 def test_the_value_is_what_was_given():

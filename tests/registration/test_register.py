@@ -9,7 +9,7 @@ import pytest
 
 from lio_jax.mapping.voxel_map import empty_map
 from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES, Registration
-from lio_jax.registration.scan_to_map import register
+from lio_jax.registration.voxel_plane_icp import register
 from tests.registration.scenes import (
     POLES_AND_WALLS,
     ROOM,

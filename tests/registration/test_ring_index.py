@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 
 from lio_jax.core.config import Config, DataConfig, FeaturesConfig
 from lio_jax.core.settings import recipe_settings
-from lio_jax.data.open import open_sequence
+from lio_jax.data.detect import open_sequence
 from lio_jax.lidar.features import loam_features
 from lio_jax.registration.ring_index import Queries, nearest_by_ring, ring_index
-from lio_jax.run.feed import padded
+from lio_jax.run.scan_inputs import padded
 from lio_jax.sim.sequence import SimulatedSequence
 
 _index = jax.jit(ring_index, static_argnums=3)

@@ -11,9 +11,9 @@ import pytest
 from lio_jax.core.config import Config, FeaturesConfig
 from lio_jax.core.settings import recipe_settings, with_overrides
 from lio_jax.lidar.features import loam_features
+from lio_jax.registration.feature_icp import register_features
 from lio_jax.registration.gauss_newton import CONVERGED, TOO_FEW_MATCHES
 from lio_jax.registration.lines_and_planes import FeaturePoints
-from lio_jax.registration.rounds import match_in_rounds
 from lio_jax.registration.scan_to_scan import ScanToScan, empty_scan, last_scan
 from tests.recipes.drive import BEAMS, COLUMNS, lidar_pose, scan
 
@@ -53,7 +53,7 @@ def target(features):
 @partial(jax.jit, static_argnums=(3, 4))
 def _matched(last, points, prediction, rounds=2, iterations=4, params=PARAMS):
     task = ScanToScan(last=last, compensated=points, T_predicted=prediction, params=params)
-    return match_in_rounds(task, rounds, iterations)
+    return register_features(task, rounds, iterations)
 
 
 @jax.jit

@@ -7,7 +7,7 @@ import pytest
 
 from lio_jax.commands.runtime import prepare_jax
 from lio_jax.core.settings import Settings, with_extrinsics, with_overrides
-from lio_jax.run.track import CompiledStep, Tracked, track
+from lio_jax.run.track import CompiledStep, ScanResult, track
 from tests.run import inertial_drive, small_drive
 from tests.run.program_cache import kept_programs
 
@@ -42,5 +42,5 @@ def step(settings: Settings) -> CompiledStep:
 
 
 @pytest.fixture(scope="session")
-def tracked(settings: Settings, step: CompiledStep) -> list[Tracked]:
+def tracked(settings: Settings, step: CompiledStep) -> list[ScanResult]:
     return list(track(settings, small_drive.moving(), step=step))

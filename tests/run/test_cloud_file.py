@@ -5,7 +5,7 @@ import pytest
 from pypcd4 import Encoding, PointCloud
 
 from lio_jax.core.errors import LioJaxError, UsageError
-from lio_jax.run.cloud_file import read_cloud, write_cloud
+from lio_jax.run.map_file import read_cloud, write_cloud
 from tests.run.clouds import read_ply
 
 POINTS = np.random.default_rng(0).normal(size=(1000, 3)).astype(np.float32)

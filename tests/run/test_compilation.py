@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.run import compilation
+from lio_jax.core import xla as compilation
 
 
 @pytest.mark.parametrize("options", [compilation._CPU_OPTIONS, {"xla_cpu_an_option_of_another_day": True}])

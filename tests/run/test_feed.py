@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.config import LidarConfig
-from lio_jax.run.feed import bucket_for, padded
+from lio_jax.run.scan_inputs import bucket_for, padded
 from tests.run.small_drive import PERIOD_NS, moving, without_points
 
 CONFIG = LidarConfig(buckets=(100, 8192))

@@ -10,7 +10,7 @@ import pytest
 
 from lio_jax.core.errors import UsageError
 from lio_jax.run.folder import RUN_FILES, run_folder, write_json
-from lio_jax.run.keyframe_store import KeyframeWriter
+from lio_jax.run.keyframes import KeyframeWriter
 
 
 def test_makes_the_folder_and_its_parents(tmp_path):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from lio_jax.data.sequence import ImuData, LidarScan
-from lio_jax.run.imu_feed import ImuFeed
+from lio_jax.run.scan_inputs import ImuFeed
 
 EPOCH_NS = 1_700_000_000_000_000_000
 BUCKETS = (32, 64, 128)

@@ -12,7 +12,7 @@ from lio_jax.core.settings import Settings
 from lio_jax.data.sequence import ImuData, LidarScan
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.run.run import imu_feed
-from lio_jax.run.track import CompiledStep, Tracked, track
+from lio_jax.run.track import CompiledStep, ScanResult, track
 from tests.run.inertial_drive import (
     END,
     RATE,
@@ -32,7 +32,7 @@ from tests.run.small_drive import without_points
 class Replayed:
     """A run's results and what it said."""
 
-    tracked: list[Tracked]
+    tracked: list[ScanResult]
     warnings: list[str]
 
     @property

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.run.keyframe_store import KeyframeWriter, read_keyframes
+from lio_jax.run.keyframes import KeyframeWriter, read_keyframes
 
 COUNT = 5
 

@@ -5,9 +5,8 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from lio_jax.run import map_tiles
-from lio_jax.run.cloud_file import read_cloud
-from lio_jax.run.map_tiles import MapTiles
+from lio_jax.run import map_file as map_tiles
+from lio_jax.run.map_file import MapTiles, read_cloud
 
 
 def clouds(count=12, points=800, apart=30.0, seed=0):

@@ -6,7 +6,7 @@ import pytest
 from lio_jax.core.config import FeaturesConfig
 from lio_jax.core.settings import recipe_settings, with_overrides
 from lio_jax.data.sequence import LidarScan
-from lio_jax.run.sensor_sizes import with_sensor_sizes
+from lio_jax.run.fitted_settings import with_sensor_sizes
 
 LOAM = recipe_settings("loam")
 

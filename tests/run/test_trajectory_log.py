@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from lio_jax.core.types import NavState
-from lio_jax.run.track import Tracked, pose_matrix
-from lio_jax.run.trajectory_log import TrajectoryLog
+from lio_jax.run.logs import TrajectoryLog
+from lio_jax.run.track import ScanResult, pose_matrix
 
 EXTRINSIC = np.array([0.5, 0.5, 0.5, 0.5, 0.1, 0.2, 0.3])
 
 
-def result(index: int) -> Tracked:
+def result(index: int) -> ScanResult:
     """Return a scan's result in which no two numbers of the state agree."""
     pose = np.array([1.0, 0.0, 0.0, 0.0, float(index), 0.0, 0.0])
     nav = NavState(
@@ -30,7 +30,7 @@ def result(index: int) -> Tracked:
     output = SimpleNamespace(
         registration=registration, covariance=None, nis=np.array(5.0), nis_dof=np.array(6)
     )
-    return Tracked(index, 100 + index, pose_matrix(pose), nav, output, 1, {}, "")
+    return ScanResult(index, 100 + index, pose_matrix(pose), nav, output, 1, {}, "")
 
 
 @pytest.fixture

@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lio_jax.sim.movers import Movers
 from lio_jax.sim.primitives import Boxes, Cylinders, Grounds, Planes, Spheres, TiltedBoxes
 from lio_jax.sim.raycast import Hit, cast
-from lio_jax.sim.worlds import Counts, Solids, World, nearest_part
+from lio_jax.sim.worlds import Counts, Movers, Solids, World, nearest_part
 
 DTYPES = [(jnp.float64, 1e-9), (jnp.float32, 1e-4)]
 """Precision of the rays, and what distances are held to, m."""

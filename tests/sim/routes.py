@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lio_jax.sim.scene import Route
+from lio_jax.sim.worlds import Route
 
 LAP = Route(
     points=np.array(

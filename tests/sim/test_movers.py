@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.sim.movers import Movers, moving_boxes
 from lio_jax.sim.primitives import Boxes
 from lio_jax.sim.traffic import Loop, car_boxes, traffic
+from lio_jax.sim.worlds import Movers, moving_boxes
 
 STEPS, PERIOD = 400, 20.0
 

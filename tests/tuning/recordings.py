@@ -9,7 +9,7 @@ import numpy as np
 from lio_jax.core.param_values import DEFAULTS
 from lio_jax.core.settings import Settings, recipe_settings, with_overrides
 from lio_jax.run.run import settings_for
-from lio_jax.run.track import Fed
+from lio_jax.run.track import ScanInput
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
 from lio_jax.tuning.recording import Recording
@@ -76,8 +76,8 @@ def settings(recipe: str, inertial: bool, *more: str) -> Settings:
 class DoubleRecording(Recording):
     """Scans whose points are held in double precision."""
 
-    def feed(self):
-        for fed in super().feed():
+    def scan_inputs(self):
+        for fed in super().scan_inputs():
             scan = replace(
                 fed.scan,
                 points=np.asarray(fed.scan.points, np.float64),
@@ -85,4 +85,4 @@ class DoubleRecording(Recording):
                 duration=jnp.float64(fed.scan.duration),
                 interval=jnp.float64(fed.scan.interval),
             )
-            yield Fed(**{**vars(fed), "scan": scan})
+            yield ScanInput(**{**vars(fed), "scan": scan})

@@ -12,10 +12,16 @@ from lio_jax.core.errors import UsageError
 from lio_jax.core.types import initial_nav_state
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.evaluation.evaluate import evaluate
-from lio_jax.tuning.named_objectives import objective_named
-from lio_jax.tuning.objective import Observed, TruePose
-from lio_jax.tuning.objectives import MarginalLikelihood, MeanOverScans, WeightedSum
-from lio_jax.tuning.trajectory_objectives import AbsoluteError, RelativeError
+from lio_jax.tuning.objectives import (
+    AbsoluteError,
+    MarginalLikelihood,
+    MeanOverScans,
+    Observed,
+    RelativeError,
+    TruePose,
+    WeightedSum,
+    objective_named,
+)
 
 COUNT = 40
 

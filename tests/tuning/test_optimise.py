@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.params import default_params
 from lio_jax.tuning.loss import Evaluated
-from lio_jax.tuning.optimise import Bounds, adam, fisher_information, lbfgsb, scoring
+from lio_jax.tuning.optimise import Bounds, adam, fisher_information, fisher_scoring, lbfgsb
 from lio_jax.tuning.parameters import free_parameters
 from lio_jax.tuning.session import HISTORY, Session
 
@@ -40,14 +40,14 @@ BEST = np.log(np.sqrt(np.mean(SAMPLES**2, 0)))
 
 
 @pytest.mark.parametrize("factor", [10.0, 0.1], ids=["too large", "too small"])
-@pytest.mark.parametrize("optimiser", [scoring, lbfgsb], ids=lambda f: f.__name__)
+@pytest.mark.parametrize("optimiser", [fisher_scoring, lbfgsb], ids=lambda f: f.__name__)
 def test_ten_times_wrong_densities_are_found(optimiser, factor):
     reached = visits(optimiser, BEST + np.log(factor), WIDE, 60)
     values = [noise_likelihood(x).value for x in reached]
     np.testing.assert_allclose(reached[int(np.argmin(values))], BEST, atol=0.02)
 
 
-@pytest.mark.parametrize("optimiser", [scoring, lbfgsb], ids=lambda f: f.__name__)
+@pytest.mark.parametrize("optimiser", [fisher_scoring, lbfgsb], ids=lambda f: f.__name__)
 def test_bounds_hold(optimiser):
     bounds = Bounds(BEST + 0.5, BEST + 3.0)
     reached = visits(optimiser, BEST + 2.0, bounds, 60)

@@ -9,9 +9,8 @@ import pytest
 from lio_jax.core.param_values import DIFFERENTIABLE
 from lio_jax.core.settings import recipe_settings
 from lio_jax.recipes import RECIPES
-from lio_jax.run.track import CompiledStep, stepped
-from lio_jax.tuning.objective import Observed
-from lio_jax.tuning.objectives import MarginalLikelihood
+from lio_jax.run.track import CompiledStep, run_steps
+from lio_jax.tuning.objectives import MarginalLikelihood, Observed
 from lio_jax.tuning.parameters import free_parameters
 from lio_jax.tuning.reverse import CheckpointedGradient
 from lio_jax.tuning.streaming import StreamingGradient
@@ -95,7 +94,7 @@ class HeldMap:
 
 def total(held, recording):
     objective, sums = Everything(), jnp.zeros(())
-    for fed, state, output in stepped(held, recording.feed()):
+    for fed, state, output in run_steps(held, recording.scan_inputs()):
         sums = objective.add(sums, Observed.of(state, output), recording.truth_at(fed.end_ns))
     return float(sums)
 

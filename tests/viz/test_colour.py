@@ -1,6 +1,6 @@
 import numpy as np
 
-from lio_jax.viz.colour import colour_by_height
+from lio_jax.viz.recording import colour_by_height
 
 
 def channels(packed):

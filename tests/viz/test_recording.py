@@ -162,7 +162,7 @@ def test_metrics_come_back(written):
 
 
 def test_the_blueprint_shows_what_is_logged(written):
-    from lio_jax.viz.blueprint import ADDED, PLOTS, RAW
+    from lio_jax.viz.recording import ADDED, PLOTS, RAW
 
     path, _ = written
     entities = _entities(path)

@@ -6,8 +6,17 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from lio_jax.viz.svg import Line, box_chart, line_chart, plan_chart, stack_chart
-from lio_jax.viz.svg_axes import WIDTH, axes_of, equal_axes, round_ticks
+from lio_jax.viz.svg import (
+    WIDTH,
+    Line,
+    axes_of,
+    box_chart,
+    equal_axes,
+    line_chart,
+    plan_chart,
+    round_ticks,
+    stack_chart,
+)
 
 
 def parsed(svg: str) -> ET.Element:

@@ -1,0 +1,168 @@
+"""Residuals of a pose graph's edges, their cost and its linearisation.
+
+The cost is half the sum of r' Omega r, with r = Log(Z^-1 T_i^-1 T_j) by the group's logarithm: the error of
+gtsam's BetweenFactor and PriorFactor, in space and in the plane. g2o's own program counts twice that, of
+residuals that are no logarithms.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lio_jax.core.geometry import skew
+from lio_jax.core.xla import computed_once
+from lio_jax.pose_graph.graph import POSITION, PRIOR, PoseGraph, Poses, between, picked, rotation_first
+
+_SERIES_BELOW = 0.3
+"""rad; below it the closed forms of the coefficients cancel."""
+
+
+class Linearised(NamedTuple):
+    """What each edge adds to the normal equations H dx = -g of a step of right perturbations."""
+
+    cost: Float[Array, " e"]
+    """r' Omega r / 2."""
+    H_ii: Float[Array, "e d d"]
+    H_ij: Float[Array, "e d d"]
+    H_jj: Float[Array, "e d d"]
+    g_i: Float[Array, "e d"]
+    g_j: Float[Array, "e d"]
+
+
+def residuals(T_world_i: Poses, T_world_j: Poses, graph: PoseGraph) -> Float[Array, "e d"]:
+    """Return Log(Z^-1 T_i^-1 T_j) of each edge, Log(Z^-1 T_j) of a prior, (0, T_j l - z) of a position.
+
+    Args:
+        T_world_i: (e,) poses of the edges' first vertices.
+        T_world_j: (e,) of their second ones.
+        graph: that the edges belong to.
+    """
+    return _residual(_missed(between(T_world_i, T_world_j), T_world_j, graph), T_world_j, graph)
+
+
+def edge_costs(poses: Poses, graph: PoseGraph) -> Float[Array, " e"]:
+    """Return r' Omega r / 2 of each edge at the given poses."""
+    r = residuals(picked(poses, graph.i), picked(poses, graph.j), graph)
+    return jnp.einsum("ei,eij,ej->e", r, graph.information, r) / 2
+
+
+def linearise(poses: Poses, graph: PoseGraph) -> Linearised:
+    """Return cost, gradient and Gauss-Newton Hessian of each edge, in closed form.
+
+    With E = Z^-1 T_i^-1 T_j perturbations move it by E exp(d_j - Ad(T_j^-1 T_i) d_i), and Log(E exp(d)) by
+    J_r^-1 d: what holds for j holds for i after a product with -Ad. A position's lever l moves by
+    R_j (v + w x l) for d = (w, v).
+    """
+    T_world_i, T_world_j = computed_once((picked(poses, graph.i), picked(poses, graph.j)))
+    across = rotation_first(between(T_world_j, T_world_i).adjoint(), axes=2)
+    across = computed_once(jnp.where(_is_unary(graph)[:, None, None], 0.0, across))
+    r = computed_once(residuals(T_world_i, T_world_j, graph))
+    A_j = right_jacobian_inverse(r)
+    A_j = jnp.where((graph.kind == POSITION)[:, None, None], _position_slope(T_world_j, graph), A_j)
+    weighted_j, weighted_r = computed_once(
+        (_product(graph.information, A_j), jnp.einsum("eij,ej->ei", graph.information, r))
+    )
+    H_jj, g_j = computed_once((_product(_turned(A_j), weighted_j), jnp.einsum("eji,ej->ei", A_j, weighted_r)))
+    H_ij = computed_once(-_product(_turned(across), H_jj))
+    return Linearised(
+        cost=jnp.sum(r * weighted_r, -1) / 2,
+        H_ii=-_product(H_ij, across),
+        H_ij=H_ij,
+        H_jj=H_jj,
+        g_i=-jnp.einsum("eji,ej->ei", across, g_j),
+        g_j=g_j,
+    )
+
+
+def right_jacobian_inverse(tangent: Float[Array, "e d"]) -> Float[Array, "e d d"]:
+    """Return the derivative of Log(exp(tangent) exp(d)) at d = 0.
+
+    J_r^-1 = I + ad / 2 + a ad^2 + b ad^4 with a = 2 / x^2 + (x + 3 sin x) / (4 x (cos x - 1)) and
+    b = 1 / x^4 + (x + sin x) / (4 x^3 (cos x - 1)), x the angle (Bullo & Murray, "Proportional derivative
+    (PD) control on the Euclidean group", 1995); in the plane ad^4 = -x^2 ad^2 and the same holds.
+    """
+    rotation = tangent[:, :3] if tangent.shape[-1] == 6 else tangent[:, :1]
+    squared = jnp.sum(rotation**2, -1)
+    near = squared < _SERIES_BELOW**2
+    x2 = jnp.where(near, 1.0, squared)
+    x = jnp.sqrt(x2)
+    less = 4 * (jnp.cos(x) - 1)
+    a = 2 / x2 + (x + 3 * jnp.sin(x)) / (x * less)
+    b = 1 / x2**2 + (x + jnp.sin(x)) / (x2 * x * less)
+    s = squared
+    a = jnp.where(near, 1 / 12 - s**2 * (1 / 30240 + s * (1 / 604800 + s / 15966720)), a)
+    b = jnp.where(near, -1 / 720 - s * (1 / 15120 + s * (1 / 403200 + s / 11975040)), b)
+    ad, a, b = computed_once((_ad(tangent), a, b))
+    ad2 = computed_once(_product(ad, ad))
+    ad4 = computed_once(_product(ad2, ad2))
+    identity = jnp.eye(tangent.shape[-1], dtype=tangent.dtype)
+    return identity + ad / 2 + a[:, None, None] * ad2 + b[:, None, None] * ad4
+
+
+def _missed(T_i_j: Poses, T_world_j: Poses, graph: PoseGraph) -> Poses:
+    """Return the pose of j as measured to where it is: Z^-1 T_i_j, Z^-1 T_world_j for one vertex alone."""
+    alone = _is_unary(graph)[:, None]
+    T_i_j = jax.tree.map(lambda single, both: jnp.where(alone, single, both), T_world_j, T_i_j)
+    return between(graph.measurement, T_i_j)
+
+
+def _residual(missed: Poses, T_world_j: Poses, graph: PoseGraph) -> Float[Array, "e d"]:
+    point = T_world_j.translation()
+    if graph.lever is not None:
+        point = point + _rotated(T_world_j, graph.lever)
+    off = point - graph.measurement.translation()
+    rotates = missed.tangent_dim - off.shape[-1]
+    position = jnp.pad(off, ((0, 0), (rotates, 0)))
+    return jnp.where((graph.kind == POSITION)[:, None], position, rotation_first(missed.log()))
+
+
+def _position_slope(T_world_j: Poses, graph: PoseGraph) -> Float[Array, "e d d"]:
+    """Return the derivative of (0, T_j exp(d) l - z) at d = 0."""
+    R = T_world_j.rotation().as_matrix()
+    size, dimensions = T_world_j.tangent_dim, R.shape[-1]
+    by_shift = jnp.pad(R, ((0, 0), (size - dimensions, 0), (size - dimensions, 0)))
+    if graph.lever is None:
+        return by_shift
+    if dimensions == 3:
+        swept = -_product(R, skew(graph.lever))
+    else:
+        swept = _rotated(T_world_j, jnp.stack([-graph.lever[:, 1], graph.lever[:, 0]], -1))[:, :, None]
+    return by_shift + jnp.pad(swept, ((0, 0), (size - dimensions, 0), (0, dimensions)))
+
+
+def _rotated(poses: Poses, vectors: Float[Array, "e k"]) -> Float[Array, "e k"]:
+    return jnp.sum(poses.rotation().as_matrix() * vectors[:, None, :], -1)
+
+
+def _is_unary(graph: PoseGraph) -> Array:
+    return graph.kind >= PRIOR
+
+
+def _ad(tangent: Float[Array, "e d"]) -> Float[Array, "e d d"]:
+    """Return the matrix whose product with another tangent is the Lie bracket of both."""
+    if tangent.shape[-1] == 6:
+        turn, shift = skew(tangent[:, :3]), skew(tangent[:, 3:])
+        none = jnp.zeros_like(turn)
+        return jnp.block([[turn, none], [shift, turn]])
+    angle, x, y = tangent.T
+    none = jnp.zeros_like(angle)
+    return jnp.stack(
+        [
+            jnp.stack([none, none, none], -1),
+            jnp.stack([y, none, -angle], -1),
+            jnp.stack([-x, angle, none], -1),
+        ],
+        -2,
+    )
+
+
+def _product(left: Float[Array, "e d d"], right: Float[Array, "e d d"]) -> Float[Array, "e d d"]:
+    """Return the products of small matrices in one vectorised loop; XLA's own is a call for each of them."""
+    terms = [left[..., :, k, None] * right[..., None, k, :] for k in range(left.shape[-1])]
+    return sum(terms[1:], terms[0])
+
+
+def _turned(matrix: Float[Array, "e d d"]) -> Float[Array, "e d d"]:
+    return jnp.swapaxes(matrix, -1, -2)

@@ -1,0 +1,156 @@
+"""Solve pose graphs: the poses that agree best with all that was measured.
+
+    graph = read_g2o(path).graph
+    solution = solve(graph)
+    covariances = marginal_covariances(graph, solution, [10, 20])
+
+The device linearises all edges at once, the host eliminates: programs are compiled for a few sizes only, and
+the order of elimination is found once per graph.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.errors import LioJaxError
+from lio_jax.pose_graph.block_cholesky import factorise
+from lio_jax.pose_graph.block_cholesky import solve as solve_factored
+from lio_jax.pose_graph.chordal import chordal_poses
+from lio_jax.pose_graph.descent import (
+    Equations,
+    Limits,
+    Padded,
+    Point,
+    descend,
+    padded,
+    padded_poses,
+    padded_weights,
+    point_after,
+)
+from lio_jax.pose_graph.graduated import Robust, graduate
+from lio_jax.pose_graph.graph import PoseGraph, Poses, Solution
+from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError, one_thread
+from lio_jax.pose_graph.structure import Structure, structure_of
+
+_VERTICES_AT_ONCE = 64
+
+
+def solve(
+    graph: PoseGraph,
+    start: Literal["chordal", "poses"] = "chordal",
+    robust: Robust | None = None,
+    limits: Limits | None = None,
+    structure: Structure | None = None,
+) -> Solution:
+    """Return the poses of least cost.
+
+    The cost is half the sum of r' Omega r with r = Log(Z^-1 T_i^-1 T_j), as in gtsam. Where nothing ties a
+    connected part of the graph to the world its first vertex keeps its pose.
+
+    Args:
+        graph: vertices and edges.
+        start: "chordal" finds the first guess from the edges; "poses" begins at the graph's own, for one that
+            was solved before and has grown a little.
+        robust: which edges may be wrong; None: all are trusted.
+        limits: when to end; None: the usual ones.
+        structure: of this graph, where it is known from an earlier solve.
+    """
+    with one_thread():
+        return _solve(graph, start, robust, limits or Limits(), structure or structure_of(graph))
+
+
+def compile_for(graph: PoseGraph) -> None:
+    """Compile what a solve of this graph needs, as far as no graph of similar size has done so already."""
+    structure = structure_of(graph)
+    whole = padded(graph, structure)
+    jax.block_until_ready(_point(whole, structure, whole.graph.poses, np.ones(len(structure.i))))
+
+
+def _solve(
+    graph: PoseGraph,
+    start: Literal["chordal", "poses"],
+    robust: Robust | None,
+    limits: Limits,
+    structure: Structure,
+) -> Solution:
+    whole = padded(graph, structure)
+    own = _point(whole, structure, whole.graph.poses, np.ones(len(structure.i)))
+    poses = whole.graph.poses
+    if start == "chordal":
+        poses = padded_poses(chordal_poses(graph, structure), len(whole.graph.fixed))
+    if robust is not None:
+        descent, weights = graduate(graph, structure, whole, poses, robust, limits)
+    else:
+        weights = np.ones(len(structure.i))
+        descent = descend(whole, structure, poses, padded_weights(weights, whole), limits)
+        if float(descent.point.cost) > float(own.cost):
+            again = descend(whole, structure, whole.graph.poses, padded_weights(weights, whole), limits)
+            descent = again._replace(iterations=descent.iterations + again.iterations)
+    return Solution(
+        poses=_unpadded(descent.point.poses, len(structure.held)),
+        cost=descent.point.cost,
+        weights=jax.device_put(weights),
+        edge_costs=jax.device_put(np.asarray(descent.point.edge_costs)[: len(weights)]),
+        initial_cost=own.cost,
+        iterations=descent.iterations,
+        status=descent.status,
+    )
+
+
+_OPEN_POSE = "the edges leave a pose open: there is no covariance of it."
+_SINGULAR = 1e12
+"""Variance times own information above which a matrix is singular as far as numbers tell."""
+
+
+def marginal_covariances(
+    graph: PoseGraph, solution: Solution, vertices: Sequence[int], structure: Structure | None = None
+) -> NDArray[np.float64]:
+    """Return covariances (k, d, d) of poses' right perturbations, rotation first; 0 of held vertices.
+
+    They are blocks of the inverse of the Gauss-Newton Hessian J' Omega J at the solution, as in gtsam.
+
+    Args:
+        graph: that was solved.
+        solution: of the graph.
+        vertices: whose covariances are asked for.
+        structure: of the graph, where it is known.
+
+    Raises:
+        LioJaxError: the graph leaves a pose open.
+    """
+    structure = structure or structure_of(graph)
+    whole = padded(graph, structure)
+    poses = padded_poses(solution.poses, len(whole.graph.fixed))
+    equations = Equations.at(_point(whole, structure, poses, np.asarray(solution.weights)), structure)
+    size = structure.tangent_size
+    covariances = np.zeros((len(vertices), size, size))
+    unknown = structure.unknown[np.asarray(vertices, np.int64)]
+    asked = np.flatnonzero(unknown < structure.count)
+    try:
+        with one_thread():
+            factor = factorise(structure.plan, equations.diagonal, equations.pairs)
+            for some in np.array_split(asked, -(-len(asked) // _VERTICES_AT_ONCE) or 1):
+                columns = np.zeros((structure.count, size, len(some), size))
+                columns[unknown[some], :, np.arange(len(some))] = np.eye(size)
+                inverse = solve_factored(factor, columns.reshape(structure.count, size, -1))
+                covariances[some] = inverse.reshape(columns.shape)[unknown[some], :, np.arange(len(some))]
+    except NotPositiveDefiniteError:
+        raise LioJaxError(_OPEN_POSE) from None
+    # rounding may leave a pivot of a singular matrix above zero
+    variances = np.diagonal(covariances[asked], axis1=1, axis2=2)
+    own = np.diagonal(equations.diagonal[unknown[asked]], axis1=1, axis2=2)
+    if np.any(variances * own > _SINGULAR):
+        raise LioJaxError(_OPEN_POSE)
+    return covariances
+
+
+def _point(whole: Padded, structure: Structure, poses: Poses, weights: NDArray[np.float64]) -> Point:
+    still = np.zeros((len(whole.places.unknown) + 1, structure.tangent_size), whole.graph.information.dtype)
+    return point_after(poses, jax.device_put(still), padded_weights(weights, whole), whole)
+
+
+def _unpadded(poses: Poses, count: int) -> Poses:
+    return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[:count]), poses)

@@ -1,0 +1,85 @@
+"""Sums over a scan's points at a pose, whose derivative costs little however many parameters there are."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lio_jax.core.implicit import with_derivative_of
+
+Rows = Callable[[Array, Array, Array, Any], Array]
+"""``(arm (3, k), shift (3,), scales (s,), constants) -> (m, k)``: what each point adds to m sums. Its place
+in world axes is ``arm`` from the sensor and ``arm + shift`` from the map's origin."""
+
+
+def point_sums(
+    total: Float[Array, " m"],
+    rows: Rows,
+    points: Float[Array, "k 3"],
+    R_world_lidar: Float[Array, "3 3"],
+    shift: Float[Array, "3"],
+    scales: Float[Array, " s"],
+    constants: Any,
+) -> Float[Array, " m"]:
+    """Return ``total``, computed already, with the derivative of the sum of ``rows`` over the points.
+
+    The derivative by each point's place is worked out once; a tangent of the points is then one product with
+    it, and those of pose and scales only see its sums. Differentiating the sum itself would work through all
+    points once per parameter.
+
+    Args:
+        total: the sum over the points.
+        rows: what is summed; it must not close over arrays that are differentiated.
+        points: in the lidar frame, m.
+        R_world_lidar: turns them into ``arm``.
+        shift: see :data:`Rows`, m.
+        scales: anything smooth that all points share.
+        constants: a pytree without a derivative.
+    """
+    # zeros are for the products with the pose's tangents; a row that counts keeps its point
+    finite = jax.lax.stop_gradient(jnp.where(jnp.isfinite(points), points, 0.0))
+    points = with_derivative_of(finite, lambda points: points, points)
+    return _summed(total, rows, points, R_world_lidar, shift, scales, constants)
+
+
+@eqx.filter_custom_jvp
+def _summed(
+    total: Array, rows: Rows, points: Array, R: Array, shift: Array, scales: Array, constants: Any
+) -> Array:
+    return total
+
+
+@_summed.def_jvp
+def _summed_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    total, rows, points, R, shift, scales, constants = primals
+    points_dot, R_dot, shift_dot, scales_dot = tangents[2:6]
+    arm = R @ points.T
+
+    def slopes(by: int) -> Array:
+        """Return the rows' derivatives by each component of one of their arguments."""
+        arguments = [arm, shift, scales]
+
+        def along(unit: Array) -> Array:
+            def moved(argument: Array) -> Array:
+                return rows(*arguments[:by], argument, *arguments[by + 1 :], constants)
+
+            direction = jnp.broadcast_to(unit[:, None], arm.shape) if by == 0 else unit
+            return jax.jvp(moved, (arguments[by],), (direction,))[1]
+
+        return jax.vmap(along)(jnp.eye(len(arguments[by]), dtype=points.dtype))
+
+    by_place = slopes(0)
+    total_dot = jnp.zeros_like(total)
+    if points_dot is not None:
+        by_point = jnp.tensordot(R.T, by_place, 1)
+        total_dot += jnp.tensordot(by_point, points_dot, ((0, 2), (1, 0)))
+    if R_dot is not None:
+        total_dot += jnp.tensordot(R_dot, jnp.tensordot(by_place, points, ((2,), (0,))), ((0, 1), (0, 2)))
+    if shift_dot is not None:
+        total_dot += shift_dot @ jnp.sum(slopes(1), -1)
+    if scales_dot is not None:
+        total_dot += scales_dot @ jnp.sum(slopes(2), -1)
+    return total, total_dot

@@ -1,0 +1,250 @@
+"""What a run keeps of every scan: state, times, match figures and overflow, and the poses at IMU rate."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jaxlie
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from lio_jax.core.files import atomic_path
+from lio_jax.core.pose_covariance import carried, covariance_of
+from lio_jax.core.settings import Settings
+from lio_jax.core.types import NavState
+from lio_jax.data.sequence import ImuData
+from lio_jax.data.trajectory import Trajectory, pose_matrices, tum_lines
+from lio_jax.imu.imu_odometry import imu_rate_trajectory
+from lio_jax.run.track import ScanResult, pose_matrix
+
+
+class TrajectoryLog:
+    """States in the order of the scans."""
+
+    def __init__(self) -> None:
+        self._rows: list[dict[str, Any]] = []
+        self._matches: list[NDArray[np.float64]] = []
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def append(self, tracked: ScanResult) -> None:
+        """Keep one result."""
+        nav, state = tracked.nav, tracked.output.covariance
+        match = _covariance(tracked) if self._rows else np.zeros((6, 6))
+        self._matches.append(match)
+        # copies: a view would keep the device's memory around it
+        whole = {} if state is None else {"state_covariance": np.array(state)}
+        pose = whole["state_covariance"][:6, :6] if whole else match
+        self._rows.append(
+            {
+                "stamps_ns": np.int64(tracked.stamp_ns),
+                "poses": tracked.T_world_imu,
+                "velocity": nav.velocity,
+                "biases": np.concatenate([nav.gyro_bias, nav.accel_bias]),
+                "gravity": nav.gravity,
+                "extrinsic": pose_matrix(nav.T_imu_lidar.wxyz_xyz),
+                "time_offset": nav.time_offset,
+                "covariance": pose,
+                "nis": np.array(tracked.output.nis),
+                "nis_dof": np.array(tracked.output.nis_dof),
+                **whole,
+            }
+        )
+
+    def nav(self, index: int) -> NavState:
+        """Return one scan's navigation state, numpy leaves."""
+        row = self._rows[index]
+        biases: Any = row["biases"]
+        return NavState(
+            T_world_imu=_se3(row["poses"], row["velocity"].dtype),
+            velocity=row["velocity"],
+            gyro_bias=biases[:3],
+            accel_bias=biases[3:],
+            gravity=row["gravity"],
+            T_imu_lidar=_se3(row["extrinsic"], row["velocity"].dtype),
+            time_offset=row["time_offset"],
+        )
+
+    def column(self, name: str) -> NDArray:
+        """Return one quantity of all scans, stacked."""
+        return np.stack([row[name] for row in self._rows])
+
+    def match_covariances(self) -> NDArray[np.float64]:
+        """Return (n, 6, 6) covariances of the poses by the matches with the map alone."""
+        return np.stack(self._matches)
+
+    def trajectory(self) -> Trajectory:
+        """Return T_world_imu at the scans' ends."""
+        return Trajectory(self.column("stamps_ns"), self.column("poses"))
+
+    def lidar_poses(self) -> NDArray[np.float64]:
+        """Return (n, 4, 4) T_world_lidar at the scans' ends."""
+        return self.column("poses") @ self.column("extrinsic")
+
+    def write_npz(self, path: Path) -> None:
+        """Write every column, one row a scan, at the scans' ends.
+
+        - ``stamps_ns`` (n,) int64;
+        - ``poses`` (n, 4, 4) T_world_imu;
+        - ``velocity`` (n, 3) of the IMU origin in world, m/s;
+        - ``biases`` (n, 6) gyroscope rad/s, then accelerometer m/s^2, IMU frame;
+        - ``gravity`` (n, 3) in world, m/s^2;
+        - ``extrinsic`` (n, 4, 4) T_imu_lidar;
+        - ``time_offset`` (n,) s: a scan stamped t was taken at IMU time t + time_offset;
+        - ``covariance`` (n, 6, 6) of the pose's right perturbation (rotation rad, position m): the filter's,
+          which in the recipe default holds the drift of the map, too; in LiDAR odometry that of the match
+          with the map alone, NaN where unknown;
+        - ``state_covariance`` (n, 24, 24) of the whole error state, from filters only;
+        - ``nis``, ``nis_dof`` (n,) normalised innovation squared and its degrees of freedom, 0 without.
+        """
+        with atomic_path(path) as aside:
+            columns: dict[str, Any] = {name: self.column(name) for name in self._rows[0]}
+            np.savez_compressed(aside, **columns)
+
+
+def _se3(pose: NDArray[np.float64], dtype: np.dtype) -> jaxlie.SE3:
+    wxyz = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
+    leaf: Any = np.concatenate([wxyz, pose[:3, 3]]).astype(dtype)
+    return jaxlie.SE3(leaf)
+
+
+def _covariance(tracked: ScanResult) -> NDArray[np.float64]:
+    """Carry the scan match's covariance from the lidar to the IMU at the scan's end."""
+    registration = tracked.output.registration
+    T_world_lidar = pose_matrix(np.asarray(registration.T_world_lidar.wxyz_xyz))
+    T_imu_lidar = np.linalg.inv(tracked.T_world_imu) @ T_world_lidar
+    return carried(covariance_of(np.asarray(registration.information)), T_imu_lidar)
+
+
+class ScanLog:
+    """Numbers in the order of the scans."""
+
+    def __init__(self) -> None:
+        self._rows: list[dict[str, Any]] = []
+
+    def append(self, number: int, tracked: ScanResult) -> None:
+        """Keep the numbers of one scan; ``number`` is its place in the recording."""
+        found = tracked.output.registration
+        self._rows.append(
+            {
+                "scan": number,
+                "points": tracked.scan_points,
+                "matches": int(found.matches),
+                "rmse": float(found.rmse),
+                "iterations": int(found.iterations),
+                "unobserved": int(np.sum(found.degenerate)),
+                "lost": bool(tracked.output.lost),
+                "failed": bool(tracked.failure),
+            }
+        )
+
+    def columns(self) -> dict[str, NDArray]:
+        """Return one quantity of all scans by name."""
+        return {name: np.array([row[name] for row in self._rows]) for name in self._rows[0]}
+
+    def write_npz(self, path: Path, stage_ms: Mapping[str, list[float]]) -> None:
+        """Write every column, one row a scan.
+
+        - ``scan`` number in the recording; ``points`` as recorded;
+        - ``matches`` points that found their counterpart in the map; ``rmse`` of their distances, m;
+        - ``iterations`` of the solve; ``unobserved`` directions of six;
+        - ``lost``: the pose is the prediction; ``failed``: metrics.json says why;
+        - ``NAME_ms`` of each stage; ``total_ms`` is what a scan took, ``decode_ms`` ran on another thread;
+          NaN where a run was interrupted.
+        """
+        stages = {f"{name}_ms": self._one_each(times) for name, times in stage_ms.items()}
+        with atomic_path(path) as aside:
+            # numpy's stubs take the keywords for its own options
+            arrays: dict[str, Any] = self.columns() | stages
+            np.savez_compressed(aside, **arrays)
+
+    def _one_each(self, times: list[float]) -> NDArray[np.float64]:
+        one_each = np.full(len(self._rows), np.nan)
+        known = times[: len(one_each)]
+        one_each[: len(known)] = known
+        return one_each
+
+
+_TOLERATED_SHARE = 0.05
+"""Share of points without room in the map that is normal at the edge of a well-filled table."""
+
+
+class Overflow:
+    """Sums over the scans of a run."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._largest = settings.config.lidar.buckets[-1]
+        self._capacity = settings.config.map.capacity
+        self._scans_over = 0
+        self._thinned_away: list[int] = []
+        self._offered = 0
+        self._dropped = 0
+
+    def add(self, tracked: ScanResult) -> None:
+        """Count one scan."""
+        output = tracked.output
+        self._scans_over += tracked.scan_points > self._largest
+        self._thinned_away.append(int(output.thinned_away))
+        self._offered += int(np.asarray(output.points_mask).sum())
+        self._dropped += int(output.map_dropped)
+
+    def metrics(self) -> dict[str, Any]:
+        """Return the sums for metrics.json."""
+        return {
+            "scans_over_largest_bucket": self._scans_over,
+            "cells_thinned_away_per_scan": float(np.median(self._thinned_away)),
+            "map_points_offered": self._offered,
+            "map_points_dropped": self._dropped,
+        }
+
+    def warnings(self) -> list[str]:
+        """Return a sentence for each capacity that is too small for this recording."""
+        sentences = []
+        if self._scans_over:
+            sentences.append(
+                f"{self._scans_over} scans hold more than {self._largest} points and were thinned to that "
+                "many evenly; append a larger size to config.lidar.buckets to use them all."
+            )
+        if self._dropped > _TOLERATED_SHARE * self._offered:
+            sentences.append(
+                f"{self._dropped} of {self._offered} points found no room in the map of {self._capacity} "
+                "voxels; raise config.map.capacity or lower params.map.reach."
+            )
+        return sentences
+
+
+_SCANS_AT_ONCE = 256
+"""Bounds the memory that a long run needs."""
+
+
+def write_imu_rate(path: Path, log: TrajectoryLog, imu: ImuData) -> None:
+    """Write T_world_imu at each inertial sample after the first scan's end and up to the last one's.
+
+    Poses follow the samples from the last corrected state on, so that they step where a scan corrects them; a
+    sample at a scan's end has that scan's pose. Stamps are on the lidar's clock.
+
+    Args:
+        path: TUM file.
+        log: of the run.
+        imu: stamps ascending strictly.
+    """
+    # a stream whose time steps back has no samples in between
+    stamps, poses = log.column("stamps_ns"), log.column("poses")
+    kept = np.flatnonzero(stamps > np.concatenate([[-1], np.maximum.accumulate(stamps)[:-1]]))
+    with atomic_path(path) as aside, aside.open("w") as file:
+        for first in range(0, len(kept) - 1, _SCANS_AT_ONCE):
+            chosen = kept[first : first + _SCANS_AT_ONCE + 1]
+            states = [log.nav(index) for index in chosen]
+            file.write(tum_lines(_between(stamps[chosen], poses[chosen], states, imu)))
+
+
+def _between(
+    stamps: NDArray[np.int64], poses: NDArray[np.float64], states: list[NavState], imu: ImuData
+) -> Trajectory:
+    times, rows = imu_rate_trajectory(stamps, states, imu.stamp_ns, imu.gyro, imu.accel)
+    found = pose_matrices(rows[:, 4:], rows[:, [1, 2, 3, 0]]) if len(rows) else np.zeros((0, 4, 4))
+    at = np.searchsorted(stamps, times).clip(max=len(stamps) - 1)
+    found = np.where((stamps[at] == times)[:, None, None], poses[at], found)
+    return Trajectory(times, found)
