@@ -25,9 +25,9 @@ class BatchPrograms:
     """A recipe's programs under one static config, for a batch of parameters."""
 
     def __init__(self, recipe: str, config: Config) -> None:
-        self.recipe = recipe_named(recipe)
-        self.init = PerShape(jax.jit(jax.vmap(partial(self.recipe.init, config), (0, None))))
-        over_states = jax.vmap(partial(self.recipe.step, config), (0, 0, None, None))
+        self.recipe = recipe_named(recipe)(config)
+        self.init = PerShape(jax.jit(jax.vmap(self.recipe.init, (0, None))))
+        over_states = jax.vmap(self.recipe.step, (0, 0, None, None))
         self.step = PerShape(jax.jit(over_states, donate_argnums=1))
 
     @property
@@ -134,11 +134,10 @@ class _BatchStep:
 
     def __init__(self, programs: BatchPrograms, params: Any) -> None:
         self.initial_state = partial(programs.init, params)
-        self._moving_as = programs.recipe.with_velocity_of
         self._step = partial(programs.step, params)
 
     def restarted(self, state: Any, imu: Any) -> Any:
-        return self._moving_as(self.initial_state(imu), state)
+        return self.initial_state(imu).with_velocity_of(state)
 
     def __call__(self, state: Any, scan: Any, imu: Any) -> tuple[Any, Any]:
         return self._step(state, scan, imu)

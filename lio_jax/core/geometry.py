@@ -108,7 +108,7 @@ def _longest(*candidates: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
 
 
 def from_blocks(
-    shape: tuple[int, int], *blocks: tuple[slice, slice, Float[Array, "r c"]]
+    shape: tuple[int, int], *blocks: tuple[slice, slice, Float[Array, "_ _"]]
 ) -> Float[Array, "n m"]:
     """Return the matrix that is zero but for the given blocks; those that overlap add up.
 

@@ -1,23 +1,25 @@
 """The recipes: pure step functions that read like the block diagrams of the systems they stand for."""
 
-from types import ModuleType
+from typing import Any
 
 from lio_jax.core.errors import UsageError
-from lio_jax.recipes import default, fast_lio2, lio_sam, loam
+from lio_jax.core.settings import Settings
+from lio_jax.recipes.default import Default
+from lio_jax.recipes.fast_lio2 import FastLio2
+from lio_jax.recipes.lio_sam import LioSam
+from lio_jax.recipes.loam import Loam
+from lio_jax.recipes.recipe import Recipe
 
-RECIPES: dict[str, ModuleType] = {
-    "default": default,
-    "fast_lio2": fast_lio2,
-    "lio_sam": lio_sam,
-    "loam": loam,
+RECIPES: dict[str, type[Recipe[Any, Any, Any]]] = {
+    "default": Default,
+    "fast_lio2": FastLio2,
+    "lio_sam": LioSam,
+    "loam": Loam,
 }
-"""By name; each module has State, Output, init(config, params, imu), step(config, params, state, scan, imu)
-and with_velocity_of(fresh, found), which gives a first state the motion of a later one: a vehicle that is
-already moving distorts its first scan, which nothing can compensate until the second."""
 
 
-def recipe_named(name: str) -> ModuleType:
-    """Return a recipe's module.
+def recipe_named(name: str) -> type[Recipe[Any, Any, Any]]:
+    """Return a recipe's class.
 
     Raises:
         UsageError: there is none of that name (lists those there are).
@@ -27,3 +29,8 @@ def recipe_named(name: str) -> ModuleType:
             f"recipe '{name}' is not known; there are: {', '.join(RECIPES)}; or give a settings file *.yaml."
         )
     return RECIPES[name]
+
+
+def recipe_of(settings: Settings) -> Recipe[Any, Any, Any]:
+    """Return the recipe that settings name, with their static config."""
+    return recipe_named(settings.recipe)(settings.config)

@@ -24,6 +24,7 @@ from lio_jax.imu.path import deskew_along
 from lio_jax.lidar.thinning import mean_per_voxel
 from lio_jax.mapping.point_map import EDGE, PointMap, empty_map, insert, move_cube
 from lio_jax.mapping.voxel_map import anchor_of
+from lio_jax.recipes import recipe
 from lio_jax.recipes.constant_velocity import (
     carried_on,
     mean_rate,
@@ -41,12 +42,13 @@ from lio_jax.recipes.inertial_filter import (
     registration_of,
 )
 from lio_jax.recipes.output import Output
+from lio_jax.recipes.recipe import Needs, Recipe
 from lio_jax.registration.association import Association, associated, no_association
 from lio_jax.registration.knn_planes import Planes, associate, linearise, no_planes
 from lio_jax.registration.voxel_plane_icp import Frame
 
 
-class State(eqx.Module):
+class State(recipe.State):
     """What is carried from scan to scan."""
 
     nav: NavState
@@ -62,107 +64,117 @@ class State(eqx.Module):
     """Scans with points seen so far."""
     map: PointMap
 
+    def with_velocity_of(self, found: "State") -> "State":
+        """Return this first state with the velocity of a later one, and with its angular rate."""
 
-def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
-    """Return the state before the first scan: at the world's origin.
+        def motion(state: Any) -> tuple[Any, ...]:
+            return state.nav.velocity, state.uncertain.nav.velocity, state.rate
 
-    Args:
-        config: static.
-        params: traced.
-        imu: samples of about a second up to the first scan's end; None: there are no inertial data.
-    """
-    start = unlevelled_start(params) if imu is None else levelled_start(params, imu)
-    none = jnp.zeros_like(start.nav.velocity)
-    return State(start.nav, start, none, none[0], jnp.int32(0), empty_map(config.map.capacity))
+        return eqx.tree_at(motion, self, motion(found))
 
 
-def with_velocity_of(fresh: State, found: State) -> State:
-    """Return the state before the first scan with the motion of another: a mere exchange of leaves."""
-    return eqx.tree_at(_motion, fresh, _motion(found))
+class FastLio2(Recipe[Config, Params, State]):
+    """FAST-LIO2."""
 
+    needs = Needs()
 
-def _motion(state: State) -> Any:
-    return state.nav.velocity, state.uncertain.nav.velocity, state.rate
+    def init(self, params: Params, imu: ImuBatch | None = None) -> State:
+        """Return the state before the first scan: at the world's origin.
 
-
-def step(
-    config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch | None = None
-) -> tuple[State, Output]:
-    """Predict by the inertial samples, correct by the scan, add the scan to the map.
-
-    Args:
-        config: static.
-        params: traced.
-        state: donate it.
-        scan: padded sweep; ``scan.interval`` is the time since the last scan's end.
-        imu: samples around that time.
-    """
-    first = state.scans == 0
-    voxel_size = params.map.voxel_size.astype(jnp.float32)
-    with jax.named_scope("predict"):
-        if imu is None:
-            to_end = scan.duration.astype(state.to_end.dtype) / 2
-            scan = until_its_middle(scan, state.to_end)
-            prior, path = predicted_without_samples(params, state.uncertain, state.rate, scan, first)
-        else:
-            to_end = jnp.zeros_like(state.to_end)
-            # as FAST-LIO2 does, the match is taken for one of the pose at the scan's end
-            prior, path = predicted(params, state.uncertain, scan, imu, first, sweep_start=scan.duration)
-        T_predicted = lidar_pose(prior.nav)
-    with jax.named_scope("thin"):
-        points, time, in_range = _filtered(config.fast_lio2.point_filter_num, params, scan)
-        points = deskew_along(path, prior.nav.T_imu_lidar, points, time)
-        spacing = params.registration.point_spacing.astype(jnp.float32)
-        thin = mean_per_voxel(points, in_range, spacing, config.lidar.registration_points)
-    with jax.named_scope("update"):
-        frame = Frame(*anchor_of(T_predicted.translation(), EDGE * params.map.voxel_size))
-        scan_match = _ScanMatch(state.map, thin.points, thin.mask, frame, params, config.knn.neighbours)
-        update, _ = corrected(config, params, prior, scan_match, scan_match.before(prior.nav))
-        posterior: NavEstimate = update.state
-        lost = (update.status > ITERATION_LIMIT) & ~first
-        T_world_lidar = lidar_pose(posterior.nav)
-    with jax.named_scope("insert"):
-        # the map is a constant of the derivative
-        _, placed = jax.lax.stop_gradient(frame.place(thin.points, T_world_lidar))
-        side = params.point_map.cube_side_length
-        margin = params.point_map.cube_margin * params.lidar.max_range
-        in_blocks = jnp.stack([side / 2, margin]).astype(jnp.float32) / (EDGE * voxel_size)
-        cube_map, added = insert(
-            state.map,
-            placed,
-            thin.mask & ~lost,
-            frame.anchor,
-            voxel_size,
-            in_blocks[0],
-            params.point_map.nearer_by.astype(jnp.float32),
+        Args:
+            params: traced.
+            imu: samples of about a second up to the first scan's end; None: there are no inertial data.
+        """
+        config = self.config
+        start = unlevelled_start(params) if imu is None else levelled_start(params, imu)
+        none = jnp.zeros_like(start.nav.velocity)
+        return State(
+            nav=start.nav,
+            uncertain=start,
+            rate=none,
+            to_end=none[0],
+            scans=jnp.int32(0),
+            map=empty_map(config.map.capacity),
         )
-        # last, because whatever still reads the map beside it would make XLA copy the map
-        cube_map = move_cube(cube_map, frame.anchor, *in_blocks)
 
-    seen = jnp.any(thin.mask)
-    rate = jnp.where(first | lost, state.rate, mean_rate(state.uncertain.nav, posterior.nav, scan))
-    new_state = State(
-        nav=carried_on(posterior.nav, rate, to_end) if imu is None else posterior.nav,
-        uncertain=posterior,
-        rate=rate,
-        to_end=to_end,
-        scans=state.scans + seen.astype(jnp.int32),
-        map=cube_map,
-    )
-    return new_state, Output(
-        registration=registration_of(update, update.measurement.aux.linearised, T_world_lidar),
-        lost=lost,
-        nis=update.innovation.nis,
-        nis_dof=update.innovation.dof,
-        points=placed,
-        points_mask=thin.mask,
-        added=added.added,
-        origin=frame.origin,
-        thinned_away=thin.dropped,
-        map_dropped=added.dropped,
-        covariance=posterior.covariance,
-        evidence=evidence_of(update, prior),
-    )
+    def step(
+        self, params: Params, state: State, scan: Scan, imu: ImuBatch | None = None
+    ) -> tuple[State, Output]:
+        """Predict by the inertial samples, correct by the scan, add the scan to the map.
+
+        Args:
+            params: traced.
+            state: donate it.
+            scan: padded sweep; ``scan.interval`` is the time since the last scan's end.
+            imu: samples around that time.
+        """
+        config = self.config
+        first = state.scans == 0
+        voxel_size = params.map.voxel_size.astype(jnp.float32)
+        with jax.named_scope("predict"):
+            if imu is None:
+                to_end = scan.duration.astype(state.to_end.dtype) / 2
+                scan = until_its_middle(scan, state.to_end)
+                prior, path = predicted_without_samples(params, state.uncertain, state.rate, scan, first)
+            else:
+                to_end = jnp.zeros_like(state.to_end)
+                # as FAST-LIO2 does, the match is taken for one of the pose at the scan's end
+                prior, path = predicted(params, state.uncertain, scan, imu, first, sweep_start=scan.duration)
+            T_predicted = lidar_pose(prior.nav)
+        with jax.named_scope("thin"):
+            points, time, in_range = _filtered(config.fast_lio2.point_filter_num, params, scan)
+            points = deskew_along(path, prior.nav.T_imu_lidar, points, time)
+            spacing = params.registration.point_spacing.astype(jnp.float32)
+            thin = mean_per_voxel(points, in_range, spacing, config.lidar.registration_points)
+        with jax.named_scope("update"):
+            frame = Frame(*anchor_of(T_predicted.translation(), EDGE * params.map.voxel_size))
+            scan_match = _ScanMatch(state.map, thin.points, thin.mask, frame, params, config.knn.neighbours)
+            update, _ = corrected(config, params, prior, scan_match, scan_match.before(prior.nav))
+            posterior: NavEstimate = update.state
+            lost = (update.status > ITERATION_LIMIT) & ~first
+            T_world_lidar = lidar_pose(posterior.nav)
+        with jax.named_scope("insert"):
+            # the map is a constant of the derivative
+            _, placed = jax.lax.stop_gradient(frame.place(thin.points, T_world_lidar))
+            side = params.point_map.cube_side_length
+            margin = params.point_map.cube_margin * params.lidar.max_range
+            in_blocks = jnp.stack([side / 2, margin]).astype(jnp.float32) / (EDGE * voxel_size)
+            cube_map, added = insert(
+                state.map,
+                placed,
+                thin.mask & ~lost,
+                frame.anchor,
+                voxel_size,
+                in_blocks[0],
+                params.point_map.nearer_by.astype(jnp.float32),
+            )
+            # last, because whatever still reads the map beside it would make XLA copy the map
+            cube_map = move_cube(cube_map, frame.anchor, *in_blocks)
+
+        seen = jnp.any(thin.mask)
+        rate = jnp.where(first | lost, state.rate, mean_rate(state.uncertain.nav, posterior.nav, scan))
+        new_state = State(
+            nav=carried_on(posterior.nav, rate, to_end) if imu is None else posterior.nav,
+            uncertain=posterior,
+            rate=rate,
+            to_end=to_end,
+            scans=state.scans + seen.astype(jnp.int32),
+            map=cube_map,
+        )
+        return new_state, Output(
+            registration=registration_of(update, update.measurement.aux.linearised, T_world_lidar),
+            lost=lost,
+            nis=update.innovation.nis,
+            nis_dof=update.innovation.dof,
+            points=placed,
+            points_mask=thin.mask,
+            added=added.added,
+            origin=frame.origin,
+            thinned_away=thin.dropped,
+            map_dropped=added.dropped,
+            covariance=posterior.covariance,
+            evidence=evidence_of(update, prior),
+        )
 
 
 def _filtered(

@@ -21,6 +21,7 @@ from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.imu.path import Path, deskew_along
 from lio_jax.lidar.thinning import ThinnedScan, thinned
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
+from lio_jax.recipes import recipe
 from lio_jax.recipes.inertial_filter import (
     Linearised,
     corrected,
@@ -36,11 +37,13 @@ from lio_jax.registration.point_evidence import point_evidence
 from lio_jax.registration.voxel_plane_icp import Frame, Matches, associate, linearise, no_matches
 
 
-class State(eqx.Module):
+class State(recipe.State):
     """What is carried from scan to scan."""
 
-    uncertain: NavEstimate
-    """Navigation state at the last scan's end, and the covariance of its error within the map."""
+    nav: NavState
+    """At the last scan's end."""
+    covariance: Float[Array, "24 24"]
+    """Of its error within the map."""
     drift: MapDrift
     prediction_error: Float[Array, ""]
     """Expected error of the next prediction, m: it opens the robust kernel."""
@@ -49,9 +52,13 @@ class State(eqx.Module):
     map: VoxelMap
 
     @property
-    def nav(self) -> NavState:
-        """The navigation state."""
-        return self.uncertain.nav
+    def estimate(self) -> NavEstimate:
+        """The navigation state and its covariance."""
+        return NavEstimate(self.nav, self.covariance)
+
+    def with_velocity_of(self, found: "State") -> "State":
+        """Return this first state with the velocity of a later one."""
+        return eqx.tree_at(lambda state: state.nav.velocity, self, found.nav.velocity)
 
 
 def init(config: Config, params: Params, imu: ImuBatch) -> State:
@@ -62,11 +69,13 @@ def init(config: Config, params: Params, imu: ImuBatch) -> State:
         params: traced.
         imu: samples of about a second up to the first scan's end.
     """
-    uncertain = levelled_start(params, imu)
+    start = levelled_start(params, imu)
+    dtype = start.covariance.dtype
     return State(
-        uncertain=uncertain,
-        drift=MapDrift.none(uncertain.covariance.dtype),
-        prediction_error=jnp.asarray(params.motion.initial_error, uncertain.covariance.dtype),
+        nav=start.nav,
+        covariance=start.covariance,
+        drift=MapDrift.none(dtype),
+        prediction_error=jnp.asarray(params.motion.initial_error, dtype),
         scans=jnp.int32(0),
         map=empty_map(config.map.capacity),
     )
@@ -86,7 +95,7 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
     spacing = params.registration.inertial_point_spacing
     thin = thinned(params, scan, spacing, config.imu.insertion_points, config.imu.registration_points)
     with jax.named_scope("predict"):
-        prior, path = predicted(params, state.uncertain, scan, imu, first)
+        prior, path = predicted(params, state.estimate, scan, imu, first)
         T_predicted = lidar_pose(prior.nav)
         still = jax.lax.stop_gradient((path, prior.nav.T_imu_lidar))
         points = deskew_along(*still, thin.points, thin.time)
@@ -118,7 +127,8 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
         drift = state.drift.carried(state.nav.T_world_imu, posterior.nav.T_world_imu)
 
     new_state = State(
-        uncertain=posterior,
+        nav=posterior.nav,
+        covariance=posterior.covariance,
         drift=drift.grown(posterior.covariance, new, state.scans),
         # it only opens the kernel, which is closed at the solution
         prediction_error=jax.lax.stop_gradient(jnp.where(first | lost, state.prediction_error, error)),

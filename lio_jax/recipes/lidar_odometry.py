@@ -15,12 +15,13 @@ from lio_jax.core.types import NavState, Scan, initial_nav_state
 from lio_jax.lidar.deskew import deskew_constant_velocity
 from lio_jax.lidar.thinning import thinned
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
+from lio_jax.recipes import recipe
 from lio_jax.recipes.output import Output
 from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES
 from lio_jax.registration.voxel_plane_icp import Frame, register
 
 
-class State(eqx.Module):
+class State(recipe.State):
     """What is carried from scan to scan."""
 
     nav: NavState
@@ -36,6 +37,10 @@ class State(eqx.Module):
     scans: Int32[Array, ""]
     """Scans with points seen so far."""
     map: VoxelMap
+
+    def with_velocity_of(self, found: "State") -> "State":
+        """Return this first state with the velocity of a later one."""
+        return eqx.tree_at(lambda state: state.twist, self, found.twist)
 
 
 def init(config: Config, params: Params) -> State:

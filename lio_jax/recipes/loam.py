@@ -28,7 +28,9 @@ from lio_jax.lidar.features import (
     loam_features,
     thinned_features,
 )
+from lio_jax.recipes import recipe
 from lio_jax.recipes.output import Output
+from lio_jax.recipes.recipe import Needs, Recipe
 from lio_jax.registration.cube_map import ScanToCubes, added_to
 from lio_jax.registration.feature_icp import register_features
 from lio_jax.registration.feature_map import FeatureMap, empty_feature_map, frames_at, placed_in
@@ -45,7 +47,7 @@ class Targets(eqx.Module):
     """In the lidar frame of the last scan's middle."""
 
 
-class State(eqx.Module):
+class State(recipe.State):
     """What is carried from scan to scan."""
 
     nav: NavState
@@ -62,125 +64,130 @@ class State(eqx.Module):
     """Scans with points seen so far."""
     map: Targets
 
-
-def init(config: Config, params: Params, imu: ImuBatch | None = None) -> State:
-    """Return the state before the first scan: at the world's origin, with an empty map.
-
-    Args:
-        config: static.
-        params: traced.
-        imu: not used.
-    """
-    features = config.features
-    check_sizes(config)
-    nav = initial_nav_state(params.extrinsics.T_imu_lidar())
-    dtype = nav.velocity.dtype
-    start = nav.T_world_imu @ nav.T_imu_lidar
-    corners = features.corners * features.sectors * features.rings
-    return State(
-        nav=nav,
-        T_odom_lidar=jaxlie.SE3(jnp.array([1, 0, 0, 0, 0, 0, 0], dtype)),
-        T_map_odom=jaxlie.SE3(start.wxyz_xyz),
-        since=jnp.zeros((), dtype),
-        twist=jnp.zeros(6, dtype),
-        scans=jnp.int32(0),
-        map=Targets(
-            empty_feature_map(config.map.capacity),
-            empty_scan(corners, features.surface_points, features.rings),
-        ),
-    )
+    def with_velocity_of(self, found: "State") -> "State":
+        """Return this first state with the velocity of a later one."""
+        return eqx.tree_at(lambda state: state.twist, self, found.twist)
 
 
-def with_velocity_of(fresh: State, found: State) -> State:
-    """Return the state before the first scan with the velocity of another: a mere exchange of leaves."""
-    return eqx.tree_at(lambda state: state.twist, fresh, found.twist)
+class Loam(Recipe[Config, Params, State]):
+    """LOAM as A-LOAM implements it."""
 
+    needs = Needs(imu="unused", rings=True)
 
-def step(
-    config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch | None = None
-) -> tuple[State, Output]:
-    """Match one scan with the last one, then with the map, and add it to the map.
+    def init(self, params: Params, imu: ImuBatch | None = None) -> State:
+        """Return the state before the first scan: at the world's origin, with an empty map.
 
-    Args:
-        config: static.
-        params: traced.
-        state: donate it.
-        scan: padded sweep; ``scan.interval`` is the time since the last scan's end.
-        imu: not used.
-    """
-    first = state.scans == 0
-    with jax.named_scope("features"):
-        features = in_single_precision(loam_features, config, params, scan)
-        enough = jnp.sum(features.sharp.mask) + jnp.sum(features.flat.mask) > params.registration.min_matches
-    with jax.named_scope("predict"):
-        middle = 0.5 * scan.duration.astype(state.twist.dtype)
-        # the first scan's end is the world's origin, however many empty scans went before
-        interval = jnp.where(first, 0.0, scan.interval.astype(state.twist.dtype))
-        elapsed = state.since + interval - middle
-        motion = _Motion(state.twist, elapsed, ~first & (elapsed > 0), middle)
-    with jax.named_scope("scan_to_scan"):
-        picks = _Compensated(features.sharp, features.flat, motion, config.loam.compensate)
-        prediction = jaxlie.SE3.exp(elapsed * state.twist)
-        # no velocity is known yet
-        opening = (state.scans == 1) | jnp.all(state.twist == 0)
-        odometry = register_features(
-            ScanToScan(last=state.map.last, compensated=picks, T_predicted=prediction, params=params),
-            jnp.where(opening, jnp.int32(config.loam.opening_rounds), jnp.int32(config.loam.rounds)),
-            config.registration.max_iterations,
+        Args:
+            params: traced.
+            imu: not used.
+        """
+        config = self.config
+        features = config.features
+        check_sizes(config)
+        nav = initial_nav_state(params.extrinsics.T_imu_lidar())
+        dtype = nav.velocity.dtype
+        start = nav.T_world_imu @ nav.T_imu_lidar
+        corners = features.corners * features.sectors * features.rings
+        return State(
+            nav=nav,
+            T_odom_lidar=jaxlie.SE3(jnp.array([1, 0, 0, 0, 0, 0, 0], dtype)),
+            T_map_odom=jaxlie.SE3(start.wxyz_xyz),
+            since=jnp.zeros((), dtype),
+            twist=jnp.zeros(6, dtype),
+            scans=jnp.int32(0),
+            map=Targets(
+                empty_feature_map(config.map.capacity),
+                empty_scan(corners, features.surface_points, features.rings),
+            ),
         )
-        T_odom_lidar = state.T_odom_lidar @ odometry.T_world_lidar
-        twist = motion.twist_to(odometry.T_world_lidar)
-    with jax.named_scope("scan_to_map"):
-        room = config.loam.corner_points, config.loam.surface_points
-        corner, surface, thinned_away = thinned_features(
-            features.less_sharp, features.less_flat, params, *room
-        )
-        thin = _Compensated(corner, surface, motion, config.loam.compensate)(odometry.T_world_lidar)
-        guess = state.T_map_odom @ T_odom_lidar
-        its_turn = state.scans % config.loam.mapping_every == 0
-        mapping = _mapped(config, params, state.map.cubes, thin, guess, odometry, its_turn)
-        lost = (mapping.status == TOO_FEW_MATCHES) & ~first
-        T = mapping.T_world_lidar
-    with jax.named_scope("insert"):
-        # the map is a constant of the derivative
-        last = _last(config, features, motion, jax.lax.stop_gradient(odometry.T_world_lidar))
-        frames = frames_at(jax.lax.stop_gradient(T.translation()), params)
-        placed = jax.lax.stop_gradient(placed_in(frames, thin, T))
-        cubes, *added = added_to(state.map.cubes, placed, its_turn & ~lost, frames, params)
 
-    T_world_imu = T @ jaxlie.SE3.exp(middle * twist) @ params.extrinsics.T_imu_lidar().inverse()
-    velocity = T_world_imu.rotation() @ (params.extrinsics.T_imu_lidar().adjoint() @ twist)[:3]
-    nav = dataclasses.replace(state.nav, T_world_imu=jaxlie.SE3(T_world_imu.wxyz_xyz), velocity=velocity)
-    # a scan too poor to be matched with leaves the last one in its place
-    of_odometry = T_odom_lidar, middle, last
-    of_odometry = jax.tree.map(
-        lambda new, old: jnp.where(enough, new, old),
-        of_odometry,
-        (state.T_odom_lidar, state.since + interval, state.map.last),
-    )
-    new_state = State(
-        nav=nav,
-        T_odom_lidar=of_odometry[0],
-        T_map_odom=jaxlie.SE3((T @ T_odom_lidar.inverse()).wxyz_xyz),
-        since=of_odometry[1],
-        twist=twist,
-        scans=state.scans + jnp.any(features.less_flat.mask).astype(jnp.int32),
-        map=Targets(cubes, of_odometry[2]),
-    )
-    corner_offset = (frames.corner.origin - frames.surface.origin).astype(placed.corner.dtype)
-    return new_state, Output(
-        registration=mapping,
-        lost=lost,
-        nis=jnp.zeros_like(middle),
-        nis_dof=jnp.int32(0),
-        points=jnp.concatenate([placed.corner + corner_offset, placed.surface]),
-        points_mask=jnp.concatenate([placed.corner_mask, placed.surface_mask]),
-        added=jnp.concatenate([insertion.added for insertion in added]),
-        origin=frames.surface.origin,
-        thinned_away=thinned_away + features.dropped,
-        map_dropped=added[0].dropped + added[1].dropped,
-        corners=jnp.arange(len(placed.corner_mask) + len(placed.surface_mask)) < len(placed.corner_mask),
-    )
+    def step(
+        self, params: Params, state: State, scan: Scan, imu: ImuBatch | None = None
+    ) -> tuple[State, Output]:
+        """Match one scan with the last one, then with the map, and add it to the map.
+
+        Args:
+            params: traced.
+            state: donate it.
+            scan: padded sweep; ``scan.interval`` is the time since the last scan's end.
+            imu: not used.
+        """
+        config = self.config
+        first = state.scans == 0
+        with jax.named_scope("features"):
+            features = in_single_precision(loam_features, config, params, scan)
+            enough = (
+                jnp.sum(features.sharp.mask) + jnp.sum(features.flat.mask) > params.registration.min_matches
+            )
+        with jax.named_scope("predict"):
+            middle = 0.5 * scan.duration.astype(state.twist.dtype)
+            # the first scan's end is the world's origin, however many empty scans went before
+            interval = jnp.where(first, 0.0, scan.interval.astype(state.twist.dtype))
+            elapsed = state.since + interval - middle
+            motion = _Motion(state.twist, elapsed, ~first & (elapsed > 0), middle)
+        with jax.named_scope("scan_to_scan"):
+            picks = _Compensated(features.sharp, features.flat, motion, config.loam.compensate)
+            prediction = jaxlie.SE3.exp(elapsed * state.twist)
+            # no velocity is known yet
+            opening = (state.scans == 1) | jnp.all(state.twist == 0)
+            odometry = register_features(
+                ScanToScan(last=state.map.last, compensated=picks, T_predicted=prediction, params=params),
+                jnp.where(opening, jnp.int32(config.loam.opening_rounds), jnp.int32(config.loam.rounds)),
+                config.registration.max_iterations,
+            )
+            T_odom_lidar = state.T_odom_lidar @ odometry.T_world_lidar
+            twist = motion.twist_to(odometry.T_world_lidar)
+        with jax.named_scope("scan_to_map"):
+            room = config.loam.corner_points, config.loam.surface_points
+            corner, surface, thinned_away = thinned_features(
+                features.less_sharp, features.less_flat, params, *room
+            )
+            thin = _Compensated(corner, surface, motion, config.loam.compensate)(odometry.T_world_lidar)
+            guess = state.T_map_odom @ T_odom_lidar
+            its_turn = state.scans % config.loam.mapping_every == 0
+            mapping = _mapped(config, params, state.map.cubes, thin, guess, odometry, its_turn)
+            lost = (mapping.status == TOO_FEW_MATCHES) & ~first
+            T = mapping.T_world_lidar
+        with jax.named_scope("insert"):
+            # the map is a constant of the derivative
+            last = _last(config, features, motion, jax.lax.stop_gradient(odometry.T_world_lidar))
+            frames = frames_at(jax.lax.stop_gradient(T.translation()), params)
+            placed = jax.lax.stop_gradient(placed_in(frames, thin, T))
+            cubes, *added = added_to(state.map.cubes, placed, its_turn & ~lost, frames, params)
+
+        T_world_imu = T @ jaxlie.SE3.exp(middle * twist) @ params.extrinsics.T_imu_lidar().inverse()
+        velocity = T_world_imu.rotation() @ (params.extrinsics.T_imu_lidar().adjoint() @ twist)[:3]
+        nav = dataclasses.replace(state.nav, T_world_imu=jaxlie.SE3(T_world_imu.wxyz_xyz), velocity=velocity)
+        # a scan too poor to be matched with leaves the last one in its place
+        of_odometry = T_odom_lidar, middle, last
+        of_odometry = jax.tree.map(
+            lambda new, old: jnp.where(enough, new, old),
+            of_odometry,
+            (state.T_odom_lidar, state.since + interval, state.map.last),
+        )
+        new_state = State(
+            nav=nav,
+            T_odom_lidar=of_odometry[0],
+            T_map_odom=jaxlie.SE3((T @ T_odom_lidar.inverse()).wxyz_xyz),
+            since=of_odometry[1],
+            twist=twist,
+            scans=state.scans + jnp.any(features.less_flat.mask).astype(jnp.int32),
+            map=Targets(cubes, of_odometry[2]),
+        )
+        corner_offset = (frames.corner.origin - frames.surface.origin).astype(placed.corner.dtype)
+        return new_state, Output(
+            registration=mapping,
+            lost=lost,
+            nis=jnp.zeros_like(middle),
+            nis_dof=jnp.int32(0),
+            points=jnp.concatenate([placed.corner + corner_offset, placed.surface]),
+            points_mask=jnp.concatenate([placed.corner_mask, placed.surface_mask]),
+            added=jnp.concatenate([insertion.added for insertion in added]),
+            origin=frames.surface.origin,
+            thinned_away=thinned_away + features.dropped,
+            map_dropped=added[0].dropped + added[1].dropped,
+            corners=jnp.arange(len(placed.corner_mask) + len(placed.surface_mask)) < len(placed.corner_mask),
+        )
 
 
 class _Motion(eqx.Module):

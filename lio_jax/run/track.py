@@ -3,7 +3,6 @@
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Protocol
 
 import jax
@@ -50,9 +49,9 @@ class Programs:
     """A recipe's programs under one static config, for any parameters and any recording."""
 
     def __init__(self, recipe: str, config: Config) -> None:
-        self.recipe = recipe_named(recipe)
-        self.init = PerShape(jax.jit(partial(self.recipe.init, config)))
-        self.step = PerShape(jax.jit(partial(self.recipe.step, config), donate_argnums=1))
+        self.recipe = recipe_named(recipe)(config)
+        self.init = PerShape(jax.jit(self.recipe.init))
+        self.step = PerShape(jax.jit(self.recipe.step, donate_argnums=1))
 
     @property
     def compile_s(self) -> float:
@@ -88,7 +87,7 @@ class CompiledStep:
     def restarted(self, state: Any, imu: Any) -> Any:
         """Return the state before the first scan, with the velocity that ``state`` found."""
         # no program of its own, which takes as long to compile as the first
-        return self._programs.recipe.with_velocity_of(self.initial_state(imu), state)
+        return self.initial_state(imu).with_velocity_of(state)
 
     def __call__(self, state: Any, scan: Any, imu: Any) -> tuple[Any, Any]:
         """Run one step; ``state`` is consumed."""

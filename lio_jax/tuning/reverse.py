@@ -59,15 +59,15 @@ class CheckpointedGradient:
 
     def __init__(self, recipe: str, config: Config, free: ParameterVector, objective: Objective) -> None:
         """Keep what shapes the programs."""
-        module = recipe_named(recipe)
+        module = recipe_named(recipe)(config)
         self.objective = objective
 
         def forward(kind: str, x: Array, state: Any, scan: Any, imu: Any) -> tuple[Any, Observed | None]:
             if kind == "init":
-                return module.init(config, free(x), imu), None
+                return module.init(free(x), imu), None
             if kind == "restart":
-                return module.with_velocity_of(module.init(config, free(x), imu), state), None
-            state, output = module.step(config, free(x), state, scan, imu)
+                return module.init(free(x), imu).with_velocity_of(state), None
+            state, output = module.step(free(x), state, scan, imu)
             return state, Observed.of(state, output)
 
         def add(x: Array, sums: Any, seen: Observed, scan: Scan, truth: TruePose) -> Any:

@@ -99,11 +99,11 @@ class _TangentSteps:
     """A recipe's programs with tangents."""
 
     def __init__(self, recipe: str, config: Config, free: ParameterVector) -> None:
-        module = recipe_named(recipe)
+        module = recipe_named(recipe)(config)
 
         def first(x: Array, imu: ImuBatch | None) -> _Moving:
             def start(x: Array) -> tuple[Any, Any]:
-                return split_smooth(module.init(config, free(x), imu))
+                return split_smooth(module.init(free(x), imu))
 
             return _moving(push_forward(start, (x,), (jnp.eye(len(x), dtype=x.dtype),)))
 
@@ -111,7 +111,7 @@ class _TangentSteps:
             smooth, fixed = split_smooth(moving.state)
 
             def forward(x: Array, smooth: Any) -> tuple[Any, Any]:
-                state, output = module.step(config, free(x), eqx.combine(smooth, fixed), scan, imu)
+                state, output = module.step(free(x), eqx.combine(smooth, fixed), scan, imu)
                 smooth, rest = split_smooth(state)
                 seen, unseen = eqx.partition(Observed.of(state, output), eqx.is_inexact_array)
                 return (smooth, seen), (rest, unseen)
@@ -122,7 +122,6 @@ class _TangentSteps:
             return _Moving(eqx.combine(smooth, rest), dot), (eqx.combine(seen, unseen), seen_dot)
 
         self.init = PerShape(jax.jit(first))
-        self.recipe = module
         self.step = PerShape(jax.jit(step, donate_argnums=1))
 
     def at(self, x: Array) -> "_StepAt":
@@ -140,8 +139,8 @@ class _StepAt:
         return self._programs.init(self._x, imu)
 
     def restarted(self, state: _Moving, imu: ImuBatch | None) -> _Moving:
-        fresh, exchanged = self.initial_state(imu), self._programs.recipe.with_velocity_of
-        return _Moving(exchanged(fresh.state, state.state), exchanged(fresh.dot, state.dot))
+        fresh = self.initial_state(imu)
+        return _Moving(fresh.state.with_velocity_of(state.state), fresh.dot.with_velocity_of(state.dot))
 
     def __call__(self, state: _Moving, scan: Scan, imu: ImuBatch | None) -> tuple[_Moving, Any]:
         return self._programs.step(self._x, state, scan, imu)

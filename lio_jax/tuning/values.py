@@ -23,18 +23,17 @@ class StreamingValues:
 
     def __init__(self, recipe: str, config: Config, free: ParameterVector, objective: Objective) -> None:
         """Keep what shapes the programs."""
-        module = recipe_named(recipe)
+        module = recipe_named(recipe)(config)
         self._objective = objective
 
         def one(x: Any, state: Any, scan: Any, imu: Any) -> tuple[Any, Observed]:
-            state, output = module.step(config, free(x), state, scan, imu)
+            state, output = module.step(free(x), state, scan, imu)
             return state, Observed.of(state, output)
 
         def add(x: Any, sums: Any, seen: Observed, scan: Scan, truth: TruePose) -> Any:
             return objective.add(sums, seen.beside(scan, free(x)), truth)
 
-        self.init = PerShape(jax.jit(jax.vmap(lambda x, imu: module.init(config, free(x), imu), (0, None))))
-        self.exchanged = module.with_velocity_of
+        self.init = PerShape(jax.jit(jax.vmap(lambda x, imu: module.init(free(x), imu), (0, None))))
         self.step = PerShape(jax.jit(jax.vmap(one, (0, 0, None, None)), donate_argnums=1))
         self._add = PerShape(jax.jit(jax.vmap(add, (0, 0, 0, None, None))))
         self._value = PerShape(jax.jit(jax.vmap(objective.value)))
@@ -55,11 +54,10 @@ class _Batch:
 
     def __init__(self, programs: StreamingValues, x: Any) -> None:
         self.initial_state = partial(programs.init, x)
-        self._exchanged = programs.exchanged
         self._step = partial(programs.step, x)
 
     def restarted(self, state: Any, imu: Any) -> Any:
-        return self._exchanged(self.initial_state(imu), state)
+        return self.initial_state(imu).with_velocity_of(state)
 
     def __call__(self, state: Any, scan: Any, imu: Any) -> tuple[Any, Any]:
         return self._step(state, scan, imu)

@@ -1,7 +1,7 @@
 """A sensor that moves with constant velocity through a hall: every pose is known in closed form."""
 
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +13,7 @@ from lio_jax.core.config import Config, LidarConfig, MapConfig
 from lio_jax.core.param_values import DEFAULTS
 from lio_jax.core.params import Params, params_from_values
 from lio_jax.core.types import Scan
-from lio_jax.recipes import default
-from lio_jax.recipes.default import State
+from lio_jax.recipes.default import Default, State
 from lio_jax.recipes.output import Output
 from lio_jax.sim.assembly import assembled
 from lio_jax.sim.lidar import column_times, spinning_lidar, sweep
@@ -121,12 +120,12 @@ def params_with(**paths: float | list[float]) -> Params:
 
 
 PARAMS = params_with()
-STEP = jax.jit(partial(default.step, CONFIG))
+STEP = jax.jit(Default(CONFIG).step)
 """Compiled once for all tests: parameters and scans are traced."""
 
 
 def initial(params: Params = PARAMS) -> State:
-    return default.init(CONFIG, params)
+    return Default(CONFIG).init(params)
 
 
 @dataclass

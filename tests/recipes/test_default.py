@@ -10,7 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.types import Scan
-from lio_jax.recipes import default, recipe_named
+from lio_jax.recipes import recipe_named
+from lio_jax.recipes.default import Default, State
+from lio_jax.recipes.output import Output
 from lio_jax.registration.gauss_newton import CONVERGED, TOO_FEW_MATCHES
 from tests.recipes.drive import (
     CONFIG,
@@ -104,7 +106,7 @@ def test_first_scan_defines_the_world(drive):
 
 def test_a_restart_with_the_velocity_takes_the_distortion_out_of_the_first_scan(drive):
     """The world's origin is then where the vehicle was at the first scan's end, the map true at once."""
-    state, steps = default.with_velocity_of(default.init(CONFIG, PARAMS), drive[3].state), []
+    state, steps = Default(CONFIG).init(PARAMS).with_velocity_of(drive[3].state), []
     assert leaves_equal(state.map, initial().map)
     for number in range(6):
         state, output = STEP(PARAMS, state, scan(number))
@@ -357,11 +359,11 @@ def test_state_keeps_its_shapes_and_types(drive):
 
 
 def test_recipe_is_found_by_its_name():
-    recipe = recipe_named("default")
-    assert recipe is default
-    state, output = jax.eval_shape(lambda s, item: recipe.step(CONFIG, PARAMS, s, item), initial(), scan(0))
-    assert isinstance(state, recipe.State)
-    assert isinstance(output, recipe.Output)
+    recipe = recipe_named("default")(CONFIG)
+    assert isinstance(recipe, Default)
+    state, output = jax.eval_shape(recipe.step, PARAMS, initial(), scan(0))
+    assert isinstance(state, State)
+    assert isinstance(output, Output)
 
 
 def test_one_program_served_all_of_it():

@@ -15,7 +15,8 @@ from lio_jax.core.error_state import EXTRINSIC_ROTATION, GYRO_BIAS, POSITION
 from lio_jax.core.param_values import DEFAULTS
 from lio_jax.core.params import Params
 from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
-from lio_jax.recipes import fast_lio2, recipe_named
+from lio_jax.recipes import recipe_named
+from lio_jax.recipes.fast_lio2 import FastLio2
 from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES
 from lio_jax.run.scan_inputs import ImuFeed, padded
 from lio_jax.sim.imu import ImuModel
@@ -48,9 +49,9 @@ def settings_with(*sets: str) -> Settings:
 
 
 CONFIG = with_overrides(recipe_settings("fast_lio2"), SMALL).config
-STEP = jax.jit(partial(fast_lio2.step, CONFIG))
+STEP = jax.jit(FastLio2(CONFIG).step)
 """Two programs for all tests: with inertial samples and without."""
-INIT = jax.jit(partial(fast_lio2.init, CONFIG))
+INIT = jax.jit(FastLio2(CONFIG).init)
 
 
 @cache
@@ -204,11 +205,11 @@ def test_one_map_point_per_voxel_and_the_map_is_of_the_street(drive):
 
 def test_a_restart_keeps_the_velocity_and_begins_anew(without, drive):
     for (states, _, _), inertial in ((without, False), (drive, True)):
-        state = fast_lio2.with_velocity_of(INIT(settings_with().params(), arrays(inertial)[1]), states[-1])
+        state = INIT(settings_with().params(), arrays(inertial)[1]).with_velocity_of(states[-1])
         assert state.scans == 0
         np.testing.assert_allclose(state.nav.T_world_imu.translation(), 0)
         assert not np.isfinite(np.asarray(state.map.off_centre)).any()
-    again = fast_lio2.with_velocity_of(INIT(settings_with().params(), None), without[0][-1])
+    again = INIT(settings_with().params(), None).with_velocity_of(without[0][-1])
     np.testing.assert_allclose(again.nav.velocity, without[0][-1].nav.velocity)
 
 
@@ -261,7 +262,7 @@ def test_repeats_bit_for_bit(drive):
 
 def test_the_map_is_donated():
     params, (inputs, before) = settings_with().params(), arrays(True)
-    step = jax.jit(partial(fast_lio2.step, CONFIG), donate_argnums=1)
+    step = jax.jit(FastLio2(CONFIG).step, donate_argnums=1)
     with warnings.catch_warnings():
         # of buffers that no output can take over
         warnings.simplefilter("error")
@@ -288,4 +289,4 @@ def test_precision_is_single_for_points_and_double_for_states(drive):
 
 
 def test_recipe_is_found_by_its_name():
-    assert recipe_named("fast_lio2") is fast_lio2
+    assert recipe_named("fast_lio2") is FastLio2

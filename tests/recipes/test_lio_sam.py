@@ -4,7 +4,7 @@ import operator
 import re
 import warnings
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -21,7 +21,8 @@ from lio_jax.core.params import Params
 from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.core.types import ImuBatch
 from lio_jax.core.xla import PerShape
-from lio_jax.recipes import lio_sam, recipe_named
+from lio_jax.recipes import recipe_named
+from lio_jax.recipes.lio_sam import LioSam
 from lio_jax.recipes.smoothed_odometry import match_as_measurement
 from lio_jax.registration.feature_map import empty_feature_map
 from lio_jax.run.scan_inputs import ImuFeed, padded
@@ -50,8 +51,8 @@ def settings_with(*sets: str) -> Settings:
 CONFIG = settings_with().config
 PARAMS = settings_with().params()
 # compiled as the runner's are
-INIT = PerShape(jax.jit(partial(lio_sam.init, CONFIG)))
-STEP = PerShape(jax.jit(partial(lio_sam.step, CONFIG)))
+INIT = PerShape(jax.jit(LioSam(CONFIG).init))
+STEP = PerShape(jax.jit(LioSam(CONFIG).step))
 
 
 @cache
@@ -230,7 +231,7 @@ def test_a_runaway_bias_starts_the_smoother_anew():
 
 def test_information_in_place_of_fixed_sigmas():
     chosen = settings_with("config.lio_sam.lidar_noise=information")
-    step = PerShape(jax.jit(partial(lio_sam.step, chosen.config)))
+    step = PerShape(jax.jit(LioSam(chosen.config).step))
     inputs, before = arrays()
     state, params = INIT(chosen.params(), before), chosen.params()
     for number in range(MOVING):
@@ -259,7 +260,7 @@ def test_a_degenerate_direction_says_nothing(weak):
 
 
 def no_match():
-    registration = jax.eval_shape(partial(lio_sam.step, CONFIG), PARAMS, *shapes())[1].registration
+    registration = jax.eval_shape(LioSam(CONFIG).step, PARAMS, *shapes())[1].registration
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), registration)
 
 
@@ -300,7 +301,7 @@ def test_precision_is_single_for_points_and_double_for_states(drive):
 
 def test_single_precision_states_are_refused():
     with jax.enable_x64(False), pytest.raises(UsageError, match=r"lio_sam needs double precision.*x64"):
-        lio_sam.init(CONFIG, settings_with().params(), arrays()[1])
+        LioSam(CONFIG).init(settings_with().params(), arrays()[1])
 
 
 def test_a_nine_axis_imu_levels_the_first_pose():
@@ -309,24 +310,24 @@ def test_a_nine_axis_imu_levels_the_first_pose():
     nine = replace(before, orientation=jnp.tile(jnp.asarray(attitude.as_quat()), (len(before.time), 1)))
     for heading, yaw in ((False, 0.0), (True, 0.7)):
         config = settings_with(f"config.imu.heading={str(heading).lower()}").config
-        state = jax.jit(partial(lio_sam.init, config))(PARAMS, nine)
+        state = jax.jit(LioSam(config).init)(PARAMS, nine)
         found = Rotation.from_matrix(np.asarray(state.nav.T_world_imu.rotation().as_matrix()))
         np.testing.assert_allclose(found.as_euler("ZYX"), [yaw, 0.05, -0.1], atol=1e-9)
 
 
 def test_without_samples_it_says_what_to_take_instead():
     with pytest.raises(UsageError, match=r"lio_sam needs inertial samples.*take loam"):
-        lio_sam.init(CONFIG, PARAMS, None)
+        LioSam(CONFIG).init(PARAMS, None)
 
 
 def test_a_recipe_without_sizes_says_where_they_come_from():
     with pytest.raises(UsageError, match=re.escape("settings_for(sequence, settings)")):
-        lio_sam.init(recipe_settings("lio_sam").config, PARAMS, arrays()[1])
+        LioSam(recipe_settings("lio_sam").config).init(PARAMS, arrays()[1])
 
 
 def test_a_restart_keeps_the_velocity_and_begins_anew(drive):
     states, _, _ = drive
-    fresh = lio_sam.with_velocity_of(INIT(PARAMS, arrays()[1]), states[-1])
+    fresh = INIT(PARAMS, arrays()[1]).with_velocity_of(states[-1])
     velocity = states[-1].nav.velocity
     np.testing.assert_array_equal(fresh.nav.velocity, velocity)
     np.testing.assert_array_equal(fresh.window.latest().velocity, velocity)
@@ -351,7 +352,7 @@ def test_repeats_bit_for_bit(drive):
 
 
 def test_the_map_is_donated():
-    step = jax.jit(partial(lio_sam.step, CONFIG), donate_argnums=1)
+    step = jax.jit(LioSam(CONFIG).step, donate_argnums=1)
     inputs, before = arrays()
     state = INIT(PARAMS, before)
     block = state.map.features.surface.point
@@ -363,4 +364,4 @@ def test_the_map_is_donated():
 
 
 def test_recipe_is_found_by_its_name():
-    assert recipe_named("lio_sam") is lio_sam
+    assert recipe_named("lio_sam") is LioSam

@@ -18,6 +18,7 @@ from lio_jax.core.params import Params
 from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.core.xla import PerShape
 from lio_jax.recipes import loam, recipe_named
+from lio_jax.recipes.loam import Loam
 from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES
 from lio_jax.run.run import settings_for
 from lio_jax.run.scan_inputs import padded
@@ -49,7 +50,7 @@ PARAMS = settings_with().params()
 @cache
 def programs(config: Config):
     """Return init and step, compiled as the runner's are."""
-    return PerShape(jax.jit(partial(loam.init, config))), PerShape(jax.jit(partial(loam.step, config)))
+    return PerShape(jax.jit(Loam(config).init)), PerShape(jax.jit(Loam(config).step))
 
 
 @cache
@@ -217,11 +218,11 @@ def test_eight_and_128_beams(sensor, rings):
 def test_a_recipe_without_sizes_says_where_they_come_from():
     settings = recipe_settings("loam")
     with pytest.raises(UsageError, match="settings_for"):
-        loam.init(settings.config, settings.params())
+        Loam(settings.config).init(settings.params())
 
 
 def test_a_restart_keeps_the_velocity_and_begins_anew(drive):
-    state = loam.with_velocity_of(loam.init(CONFIG, PARAMS), drive[0][-1])
+    state = Loam(CONFIG).init(PARAMS).with_velocity_of(drive[0][-1])
     assert state.scans == 0
     np.testing.assert_array_equal(state.twist, drive[0][-1].twist)
     assert not np.isfinite(np.asarray(state.map.cubes.surface.off_centre)).any()
@@ -272,7 +273,7 @@ def test_repeats_bit_for_bit(drive):
 
 
 def test_the_map_is_donated():
-    step = jax.jit(partial(loam.step, CONFIG), donate_argnums=1)
+    step = jax.jit(Loam(CONFIG).step, donate_argnums=1)
     with warnings.catch_warnings():
         # of buffers that no output can take over
         warnings.simplefilter("error")
@@ -289,4 +290,4 @@ def test_precision_is_single_for_points_and_double_for_poses(drive):
 
 
 def test_recipe_is_found_by_its_name():
-    assert recipe_named("loam") is loam
+    assert recipe_named("loam") is Loam

@@ -1,7 +1,6 @@
 """Parameters are traced: changing one recompiles nothing, a batch of them is a vmap, the state is donated."""
 
 import warnings
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -12,7 +11,7 @@ import pytest
 from lio_jax.core.param_values import DEFAULTS
 from lio_jax.core.params import default_params
 from lio_jax.core.types import state_dtype
-from lio_jax.recipes import default
+from lio_jax.recipes.default import Default
 from tests.recipes.drive import (
     CONFIG,
     PARAMS,
@@ -69,8 +68,8 @@ def test_a_batch_of_parameters_equals_one_run_after_another():
     """Up to float32: batched sums and divisions are rounded otherwise, and a point may change its voxel."""
     scans = [scan(number) for number in range(5)]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(params_with(**changes) for changes in SETS))
-    step = jax.jit(jax.vmap(partial(default.step, CONFIG), in_axes=(0, 0, None)))
-    states = jax.vmap(partial(default.init, CONFIG))(batch)
+    step = jax.jit(jax.vmap(Default(CONFIG).step, in_axes=(0, 0, None)))
+    states = jax.vmap(Default(CONFIG).init)(batch)
     poses = []
     for item in scans:
         states, outputs = step(batch, states, item)
@@ -87,7 +86,7 @@ def test_a_batch_of_parameters_equals_one_run_after_another():
 
 
 def test_the_state_is_donated():
-    step = jax.jit(partial(default.step, CONFIG), donate_argnums=1)
+    step = jax.jit(Default(CONFIG).step, donate_argnums=1)
     kept = run([scan(number) for number in range(3)])
     state = jax.tree.map(jnp.array, initial())
     with warnings.catch_warnings():
@@ -104,8 +103,8 @@ def test_the_state_is_donated():
 def test_single_precision_states_where_x64_is_off():
     with jax.enable_x64(False):
         params = params_with()
-        step = jax.jit(partial(default.step, CONFIG))
-        state = default.init(CONFIG, params)
+        step = jax.jit(Default(CONFIG).step)
+        state = Default(CONFIG).init(params)
         for number in range(6):
             state, output = step(params, state, scan(number))
         assert {str(leaf.dtype) for leaf in jax.tree.leaves((state, output))} <= {

@@ -1,0 +1,78 @@
+"""What a recipe is: a static config, traced parameters, and two pure functions from scan to scan."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, Literal, TypeVar
+
+import equinox as eqx
+
+from lio_jax.core.types import ImuBatch, NavState, Scan
+from lio_jax.recipes.output import Output
+
+
+class State(eqx.Module):
+    """What a recipe carries from scan to scan: a pytree with a navigation state and a map."""
+
+    nav: eqx.AbstractVar[NavState]
+    """At the last scan's end."""
+    map: eqx.AbstractVar[Any]
+    """What scans are matched with: a pytree, a constant of the derivative."""
+
+    @abstractmethod
+    def with_velocity_of(self, found: Any) -> Any:
+        """Return this first state with the velocity that a later state found; every other leaf stays.
+
+        A vehicle that is already moving distorts its first scan, which nothing can compensate before the
+        second scan shows the velocity.
+        """
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a recipe asks of a recording."""
+
+    imu: Literal["required", "used", "unused"] = "used"
+    """required: the recipe refuses to run without inertial samples; used: it runs without, less well."""
+    rings: bool = False
+    """Features are found along the sensor's rings."""
+    point_times: bool = True
+    """The motion within a sweep is compensated where the points have times."""
+
+
+C = TypeVar("C")
+P = TypeVar("P")
+S = TypeVar("S", bound=State)
+
+
+@dataclass(frozen=True)
+class Recipe(ABC, Generic[C, P, S]):
+    """An odometry system as pure functions.
+
+    Two recipes of one class with equal configs are equal and have the same hash: compiled programs are kept
+    by them.
+    """
+
+    config: C
+    """Static settings: what shapes arrays or chooses code."""
+
+    needs: ClassVar[Needs] = Needs()
+
+    @abstractmethod
+    def init(self, params: P, imu: ImuBatch | None = None) -> S:
+        """Return the state before the first scan: at the world's origin, with an empty map.
+
+        Args:
+            params: traced.
+            imu: samples of about a second up to the first scan's end; None: there are no inertial samples.
+        """
+
+    @abstractmethod
+    def step(self, params: P, state: S, scan: Scan, imu: ImuBatch | None = None) -> tuple[S, Output]:
+        """Estimate one scan's pose and add the scan to the map.
+
+        Args:
+            params: traced.
+            state: after the scan before; it may be donated.
+            scan: padded sweep; ``scan.interval`` is the time since the last scan's end.
+            imu: samples around that time; None: there are no inertial samples.
+        """
