@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint bench settings clean
 
 demo: $(VENV)/.installed
 	$(BIN)/lio-jax demo --out out/demo --overwrite
@@ -34,6 +34,9 @@ $(VENV)/.installed-dev: pyproject.toml constraints.txt | $(BIN)/python
 $(VENV)/.installed-bench: pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) --editable '.[dev,bench]'
 	touch $@ $(VENV)/.installed $(VENV)/.installed-dev
+
+settings: $(VENV)/.installed
+	$(BIN)/python -m lio_jax.settings.generate configs/recipes docs/settings.md
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info

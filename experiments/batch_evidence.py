@@ -17,7 +17,6 @@ from jaxtyping import Array, Float
 
 from lio_jax.core.error_state import BIASES, POSITION, ROTATION, VELOCITY
 from lio_jax.core.geometry import rotation_matrix
-from lio_jax.core.params import ImuParams
 from lio_jax.estimation.block_tridiagonal import BlockTridiagonal, factorise, log_determinant, solve
 from lio_jax.estimation.chain import Chain
 from lio_jax.estimation.imu_factor import imu_information, imu_residual
@@ -27,6 +26,7 @@ from lio_jax.estimation.pose_logarithm import log_and_jacobian
 from lio_jax.estimation.quadratic import Quadratic
 from lio_jax.imu.discretise import discretise, process_noise
 from lio_jax.imu.increments import NAV_DOF, accumulate, nav_transition, sensitivity
+from lio_jax.imu.params import ImuParams
 from lio_jax.imu.sampling import Intervals
 from lio_jax.imu.sweep_mean_error import LAG_DOF, lag_of_inputs, still_to_show
 

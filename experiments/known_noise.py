@@ -76,7 +76,7 @@ class Workshop:
     def __init__(
         self, recipe: str, seconds: float, objective: str, world: str, surface: bool = False
     ) -> None:
-        from lio_jax.core.settings import with_overrides
+        from lio_jax.settings.settings import with_overrides
         from lio_jax.tuning.loss import Loss
         from lio_jax.tuning.objectives import objective_named
         from lio_jax.tuning.parameters import free_parameters
@@ -197,8 +197,8 @@ class Workshop:
         return SimulatedSequence(world, "generic32", self.seconds, seed, imu=ImuModel(**DENSITIES), **SIZE)
 
     def _settings(self, sequence: Any) -> Any:
-        from lio_jax.core.settings import recipe_settings, with_overrides
         from lio_jax.run.run import settings_for
+        from lio_jax.settings.settings import recipe_settings, with_overrides
 
         chosen = with_overrides(recipe_settings(self._recipe), list(TUNINGS[self._recipe].overrides))
         return settings_for(sequence, chosen)[0]

@@ -1,15 +1,11 @@
 """The public names and where they live: read by type checkers, and on first use of a name."""
 
 from .ablation.execute import run_ablation as run_ablation
-from .core.config import Config as Config
 from .core.errors import LioJaxError as LioJaxError
 from .core.errors import UsageError as UsageError
-from .core.params import Params as Params
-from .core.params import default_params as default_params
-from .core.settings import Settings as Settings
-from .core.settings import load_settings as load_settings
-from .core.settings import recipe_settings as recipe_settings
-from .core.settings import with_overrides as with_overrides
+from .core.leaf import leaf as leaf
+from .core.leaf import section as section
+from .core.leaf import static as static
 from .data import LidarScan as LidarScan
 from .data import Sequence as Sequence
 from .data import Trajectory as Trajectory
@@ -21,6 +17,17 @@ from .lidar.features import loam_features as loam_features
 from .mapping.voxel_map import anchor_of as anchor_of
 from .recipes.inertial_filter import lidar_pose as lidar_pose
 from .recipes.inertial_filter import predicted as predicted
+from .recipes.output import Output as Output
+from .recipes.params import ExtrinsicsParams as ExtrinsicsParams
+from .recipes.params import InertialConfig as InertialConfig
+from .recipes.params import InertialParams as InertialParams
+from .recipes.params import LimitParams as LimitParams
+from .recipes.params import MotionParams as MotionParams
+from .recipes.params import RecipeConfig as RecipeConfig
+from .recipes.params import RecipeParams as RecipeParams
+from .recipes.recipe import Needs as Needs
+from .recipes.recipe import Recipe as Recipe
+from .recipes.recipe import State as State
 from .registration.voxel_plane_icp import Frame as Frame
 from .registration.voxel_plane_icp import associate as associate
 from .registration.voxel_plane_icp import point_noise as point_noise
@@ -33,6 +40,11 @@ from .run.track import ScanResult as ScanResult
 from .run.track import run_steps as run_steps
 from .run.track import scan_inputs as scan_inputs
 from .run.track import track as track
+from .settings.settings import Settings as Settings
+from .settings.settings import load_settings as load_settings
+from .settings.settings import recipe_of as recipe_of
+from .settings.settings import recipe_settings as recipe_settings
+from .settings.settings import with_overrides as with_overrides
 from .sim.gps import GpsModel as GpsModel
 from .sim.imu import ImuModel as ImuModel
 from .sim.sequence import SimulatedSequence as SimulatedSequence

@@ -24,14 +24,15 @@ FLOORS = {
     "recipes": 4,
     "data": 4,
     "sim": 4,
-    "run": 5,
-    "evaluation": 6,
-    "tuning": 6,
-    "ablation": 6,
-    "inspection": 6,
-    "viz": 6,
-    "commands": 7,
-    "cli": 7,
+    "settings": 5,
+    "run": 6,
+    "evaluation": 7,
+    "tuning": 7,
+    "ablation": 7,
+    "inspection": 7,
+    "viz": 7,
+    "commands": 8,
+    "cli": 8,
 }
 
 NEIGHBOURS = {

@@ -43,7 +43,7 @@ def recorded(path: Path, name: str | None, start: int, count: int | None) -> Dat
         start: first scan.
         count: number of scans; None: all.
     """
-    from lio_jax.core.config import DataConfig
+    from lio_jax.data.config import DataConfig
     from lio_jax.data.detect import open_sequence
 
     sequence = open_sequence(path, DataConfig())

@@ -55,7 +55,7 @@ def _options() -> argparse.Namespace:
 def _scans() -> "dict[str, tuple[LidarScan, tuple[int, int, int]]]":
     from datasets import REAL
 
-    from lio_jax.core.config import DataConfig
+    from lio_jax.data.config import DataConfig
     from lio_jax.data.detect import open_sequence
     from lio_jax.sim.sequence import SimulatedSequence
 
@@ -76,20 +76,19 @@ def _programs(scan: "LidarScan", sizes: tuple[int, int, int]) -> dict[str, dict[
     import jax
     import jax.numpy as jnp
 
-    from lio_jax.core.config import Config, FeaturesConfig
-    from lio_jax.core.param_values import DEFAULTS
-    from lio_jax.core.params import params_from_values
     from lio_jax.lidar.features import lio_sam_features, lio_sam_rings, loam_features, loam_rings
+    from lio_jax.lidar.params import LoamRingConfig
     from lio_jax.lidar.range_image import range_image
     from lio_jax.run.scan_inputs import padded
+    from tests.params import DEFAULTS, Config, params_from_values
 
     rings, room, columns = sizes
     scan_on_device = jax.tree.map(jnp.asarray, padded(scan, None, Config().lidar))
     lio_sam_values = {"features": DEFAULTS["features"] | {"corner_threshold": 1.0, "surface_spacing": 0.4}}
     recipes = {
-        "loam": (FeaturesConfig(rings=rings, columns=room), DEFAULTS, loam_rings, loam_features),
+        "loam": (LoamRingConfig(rings=rings, columns=room), DEFAULTS, loam_rings, loam_features),
         "lio_sam": (
-            FeaturesConfig(rings=rings, columns=columns, order="azimuth"),
+            LoamRingConfig(rings=rings, columns=columns, order="azimuth"),
             DEFAULTS | lio_sam_values,
             lio_sam_rings,
             lio_sam_features,

@@ -13,8 +13,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from lio_jax.core.settings import Settings, with_extrinsics
 from lio_jax.run.track import track
+from lio_jax.settings.settings import Settings, with_extrinsics
 from lio_jax.sim.sequence import SimulatedSequence
 
 

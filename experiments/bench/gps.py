@@ -60,10 +60,10 @@ def measured(seed: int, outage: float) -> dict[str, Any]:
     from loops import absolute_error, lap_twice
     from simulated_keyframes import drifted, times_along
 
-    from lio_jax.core.settings import Settings
     from lio_jax.loops.back_end import BackEnd
     from lio_jax.loops.gps import GpsGate
     from lio_jax.loops.keyframe import Keyframe
+    from lio_jax.settings.settings import Settings
 
     truth = lap_twice("city", seed)
     seconds = times_along(truth, SPEED)

@@ -48,9 +48,9 @@ def main() -> None:
 def measured(scans: int) -> dict[str, float]:
     """Return the medians per scan of both, in one process."""
     from lio_jax import ImuModel, SimulatedSequence
-    from lio_jax.core.settings import recipe_settings
     from lio_jax.run.run import peak_rss_mb, settings_for
     from lio_jax.run.track import CompiledStep, run_steps
+    from lio_jax.settings.settings import recipe_settings
     from lio_jax.tuning.objectives import objective_named
     from lio_jax.tuning.parameters import free_parameters
     from lio_jax.tuning.recording import Recording

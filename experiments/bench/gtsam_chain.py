@@ -5,9 +5,9 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from simulated_chain import IMU, Recording
 
-from lio_jax.core.params import ImuParams
 from lio_jax.estimation.imu_factor import FLOOR
 from lio_jax.estimation.motion_state import MotionState
+from lio_jax.imu.params import ImuParams
 
 ORDER = [*range(9), 12, 13, 14, 9, 10, 11]
 """gtsam has the accelerometer's bias before the gyroscope's."""

@@ -187,7 +187,7 @@ class _Side:
     """The worker's own state."""
 
     def __init__(self, maker: Maker, recording: Path) -> None:
-        from lio_jax.core.config import DataConfig
+        from lio_jax.data.config import DataConfig
         from lio_jax.data.native import NativeSequence
 
         self._maker, self._recording = maker, recording

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from systems import Pose
 
-from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.run.fitted_settings import with_sensor_sizes
 from lio_jax.run.run import imu_feed
 from lio_jax.run.scan_inputs import bucket_for
 from lio_jax.run.track import CompiledStep, track
+from lio_jax.settings.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 
 _OPENING = 3
 """Scans in which every program of a drive has been compiled once: init, restart, step."""

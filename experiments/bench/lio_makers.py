@@ -7,7 +7,7 @@ from inertial_peers import INERTIAL_PEERS, Rig
 from isolated import Maker
 from systems import PEERS, System
 
-from lio_jax.core.config import DataConfig
+from lio_jax.data.config import DataConfig
 from lio_jax.data.native import NativeSequence
 
 _KISS = "kiss-icp"

@@ -150,7 +150,7 @@ def _errors(name: str, outcome: "Outcome", path: Path) -> dict[str, Any]:
     from lio_makers import instant_of
     from scoring import Reference, lost_after, score
 
-    from lio_jax.core.config import DataConfig
+    from lio_jax.data.config import DataConfig
     from lio_jax.data.native import NativeSequence
     from lio_jax.data.trajectory import Trajectory
 

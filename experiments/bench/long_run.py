@@ -50,9 +50,9 @@ def main() -> None:
 def driven(options: argparse.Namespace) -> dict[str, Any]:
     """Return the times, the memory and the errors of a drive."""
     from lio_jax import GpsModel, ImuModel, SimulatedSequence
-    from lio_jax.core.settings import recipe_settings, with_overrides
     from lio_jax.evaluation.evaluate import evaluate
     from lio_jax.run.run import run_sequence, settings_for
+    from lio_jax.settings.settings import recipe_settings, with_overrides
 
     gps = GpsModel() if options.gps else None
     sequence = SimulatedSequence(options.world, "vlp16", 0.1 * options.scans, 0, imu=ImuModel(), gps=gps)

@@ -103,9 +103,9 @@ def measured(keyframes: "list[Keyframe]", truth: np.ndarray) -> dict[str, Any]:
 
 def closed(keyframes: "list[Keyframe]") -> "tuple[LoopCloser, Correction, np.ndarray]":
     """Return the loops of a drive, what its poses became, and each keyframe's s."""
-    from lio_jax.core.settings import Settings
     from lio_jax.loops.back_end import BackEnd
     from lio_jax.loops.closing import LoopCloser
+    from lio_jax.settings.settings import Settings
 
     settings = Settings()
     closer = LoopCloser(settings)

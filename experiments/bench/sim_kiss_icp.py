@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lio_jax.cli import main as lio_jax
 from lio_jax.commands.sim import truth_beside
-from lio_jax.core.config import DataConfig
+from lio_jax.data.config import DataConfig
 from lio_jax.data.rosbag import RosbagSequence
 from lio_jax.data.trajectory import Trajectory, read_tum
 from lio_jax.evaluation.alignment import align

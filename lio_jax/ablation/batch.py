@@ -9,16 +9,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from lio_jax.core.config import Config
 from lio_jax.core.errors import LioJaxError
-from lio_jax.core.settings import Settings
 from lio_jax.core.xla import PerShape
 from lio_jax.data.prefetch import prefetched
 from lio_jax.data.sequence import Sequence
 from lio_jax.recipes import recipe_named
+from lio_jax.recipes.params import RecipeConfig as Config
 from lio_jax.run.logs import Overflow, TrajectoryLog
 from lio_jax.run.run import check_start, failure_record, imu_feed, percentiles
 from lio_jax.run.track import ResultBuilder, ScanResult, run_steps, scan_inputs
+from lio_jax.settings.settings import Settings
 
 
 class BatchPrograms:
@@ -48,8 +48,8 @@ class BatchedRun:
 def same_batch(settings: Settings) -> tuple[Any, ...]:
     """Return what the members of a batch have to share."""
     offset = settings.values["extrinsics"]["time_offset"]
-    estimated = settings.values["initial"]["time_offset_sigma"] > 0
-    return settings.recipe, settings.config, offset, estimated
+    estimated = settings.values.get("initial", {}).get("time_offset_sigma", 0.0) > 0
+    return settings.recipe, settings.config, settings.run, offset, estimated
 
 
 def run_batch(
@@ -77,7 +77,7 @@ def run_batch(
     imu, imu_notes = imu_feed(sequence, first)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[one.params() for one in settings])
     runs = [_Run(one, start) for one in settings]
-    scans: Any = prefetched(sequence.scans(start, count), first.config.data.prefetch)
+    scans: Any = prefetched(sequence.scans(start, count), first.run.data.prefetch)
     compiled = programs.compile_s
     for fed, state, output in run_steps(_BatchStep(programs, stacked), scan_inputs(first, scans, imu)):
         nav, seen = jax.device_get((state.nav, output))

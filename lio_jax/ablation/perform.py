@@ -11,16 +11,17 @@ from lio_jax.ablation.results import write_result
 from lio_jax.ablation.sources import KeptSequence, Source
 from lio_jax.ablation.store import DiskError, Store
 from lio_jax.ablation.tasks import Task
-from lio_jax.core.config import Config, DataConfig
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import atomic_path
-from lio_jax.core.settings import Settings
+from lio_jax.data.config import DataConfig
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory, write_tum
 from lio_jax.evaluation.evaluate import evaluate
+from lio_jax.recipes.params import RecipeConfig as Config
 from lio_jax.run.folder import write_json, write_text
 from lio_jax.run.run import run_sequence, settings_for
 from lio_jax.run.track import CompiledStep, Programs
+from lio_jax.settings.settings import Settings
 
 _KEPT = {"trajectory.tum", "metrics.json", "config.yaml"}
 """Of a run folder, where not everything is kept."""
@@ -41,7 +42,7 @@ def perform(tasks: tuple[Task, ...], store: Store, whole_run: WholeRun | None = 
     if not left:
         return
     try:
-        sequence, truth = _recording(left[0].source, left[0].source_key, left[0].settings.config.data)
+        sequence, truth = _recording(left[0].source, left[0].source_key, left[0].settings.run.data)
     except Exception as error:
         for task in left:
             _fail(store, task, error)

@@ -12,8 +12,8 @@ from lio_jax.ablation.spec import numbers_in
 from lio_jax.ablation.store import Store
 from lio_jax.ablation.tasks import Task, code_version
 from lio_jax.core.files import atomic_path
-from lio_jax.core.settings import Settings
 from lio_jax.run.folder import processor, usable_cores, write_json
+from lio_jax.settings.settings import Settings
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError, UsageError
+from lio_jax.data.config import DataConfig
 from lio_jax.data.detect import open_sequence
 from lio_jax.data.kitti import pose_files
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Sequence, SequenceInfo

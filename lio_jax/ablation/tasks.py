@@ -12,7 +12,7 @@ from typing import Any
 from lio_jax.ablation.sources import Source, key_of
 from lio_jax.ablation.spec import Spec
 from lio_jax.ablation.variants import Variant
-from lio_jax.core.settings import Settings
+from lio_jax.settings.settings import Settings
 
 _FORMAT = 1
 """Of what a task leaves behind; another number runs everything anew."""

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.settings import Settings, checked_together, load_settings, recipe_settings
 from lio_jax.recipes import recipe_named
+from lio_jax.settings.settings import Settings, checked_together, load_settings, recipe_settings
 
 Overrides = dict[str, Any]
 

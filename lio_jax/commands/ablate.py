@@ -22,11 +22,11 @@ from lio_jax.ablation.tasks import Task, tasks_of
 from lio_jax.commands.run import run_into
 from lio_jax.commands.runtime import prepare_jax, say
 from lio_jax.core.errors import LioJaxError
-from lio_jax.core.settings import Settings
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.data.whole_output import disk_errors_said
 from lio_jax.run.folder import write_text
+from lio_jax.settings.settings import Settings
 
 
 def ablate(spec_path: Path, out: Path, scheduler: str, report: bool, retry_failed: bool) -> None:

@@ -9,14 +9,14 @@ import yaml
 from numpy.typing import NDArray
 
 from lio_jax.commands.runtime import say
-from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.core.files import atomic_path
-from lio_jax.core.settings import settings_from_yaml
+from lio_jax.data.config import DataConfig
 from lio_jax.data.detect import open_sequence
 from lio_jax.data.imu_checks import GAP_FACTOR, STANDARD_GRAVITY, cleaned, first_motion
 from lio_jax.data.sequence import ImuData
 from lio_jax.imu.allan import NoiseFit, allan_deviation, averaging_factors, fit_noise
+from lio_jax.settings.settings import settings_from_yaml
 
 MIN_SECONDS = 30.0
 """Shorter recordings do not tell white noise at an averaging time of 1 s."""

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from lio_jax.commands.run import run_and_report
 from lio_jax.commands.runtime import say
-from lio_jax.core.settings import Settings
+from lio_jax.settings.settings import Settings
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
 

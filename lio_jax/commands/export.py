@@ -11,9 +11,9 @@ from tqdm import tqdm
 from lio_jax.commands.run import resolve_settings
 from lio_jax.commands.runtime import say
 from lio_jax.commands.sim import truth_beside
-from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.data.bag_writer import FORMAT_OF_ENDING, BagFormat, write_bag
+from lio_jax.data.config import DataConfig
 from lio_jax.data.detect import open_sequence
 from lio_jax.data.kitti_writer import write_kitti
 from lio_jax.data.native_writer import write_native
@@ -43,7 +43,7 @@ def export(
     """
     if start < 0 or (scans is not None and scans < 1):
         raise UsageError(f"--start must be 0 or more and --scans 1 or more, not {start} and {scans}.")
-    config = resolve_settings("default", assignments).config.data
+    config = resolve_settings("default", assignments).run.data
     bag_format = _bag_format(out, to)
     sequence = open_sequence(data, config)
     check_start(sequence, start)

@@ -10,14 +10,14 @@ from tqdm import tqdm
 from lio_jax.commands.runtime import say
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.core.files import atomic_path
-from lio_jax.core.settings import Settings, load_settings, recipe_settings, with_overrides
 from lio_jax.data.detect import open_sequence
-from lio_jax.data.foreign_settings import ForeignKey, ForeignSettings, load_foreign_settings
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory, write_tum
 from lio_jax.recipes import recipe_named
 from lio_jax.run.folder import run_folder, write_json
 from lio_jax.run.run import Observer, RunResult, check_start, run_sequence, settings_for
+from lio_jax.settings.settings import Settings, load_settings, recipe_settings, with_overrides
+from lio_jax.settings.translate import ForeignKey, ForeignSettings, load_foreign_settings
 from lio_jax.viz.recording import Recording
 from lio_jax.viz.run_record import read_correction
 from lio_jax.viz.run_recording import RecordingObserver
@@ -135,9 +135,9 @@ def run(
     if start < 0 or (scans is not None and scans < 1):
         raise UsageError(f"--start must be 0 or more and --scans 1 or more, not {start} and {scans}.")
     settings = resolve_settings(recipe, assignments, params_from)
-    sequence = open_sequence(data, settings.config.data)
+    sequence = open_sequence(data, settings.run.data)
     truth = truth_of(sequence, gt)
-    if live and not settings.config.output.recording:
+    if live and not settings.run.output.recording:
         raise UsageError("--live shows the recording, and config.output.recording=false leaves it out.")
     run_and_report(sequence, settings, out, start, scans, truth, overwrite, live)
 
@@ -182,7 +182,7 @@ def run_into(
     with ExitStack() as stack:
         observers: list[Observer] = []
         recording = None
-        if settings.config.output.recording:
+        if settings.run.output.recording:
             address = _live_viewer(stack) if live else None
             recording = stack.enter_context(Recording(out / "recording.rrd", total, address))
             observers.append(RecordingObserver(recording))
@@ -267,13 +267,13 @@ def _finish(result: RunResult, truth: Trajectory | None, settings: Settings, out
             with atomic_path(out / "truth.tum") as aside:
                 write_tum(aside, match_by_time(result.trajectory, truth).reference)
     write_json(out / "metrics.json", result.metrics)
-    if settings.config.output.plot:
+    if settings.run.output.plot:
         from lio_jax.viz.plot import plot_timings, plot_trajectory
 
         plot_trajectory(out / "trajectory.png", result.trajectory, truth, name)
         stages = {name: ms for name, ms in result.stage_ms.items() if ms and name != "total"}
         plot_timings(out / "timings.png", stages)
-    if settings.config.output.report:
+    if settings.run.output.report:
         from lio_jax.viz.report import write_report
 
         write_report(out)

@@ -14,9 +14,9 @@ from lio_jax.commands.run import resolve_settings, truth_of
 from lio_jax.commands.runtime import say
 from lio_jax.core.errors import UsageError
 from lio_jax.core.files import atomic_path
-from lio_jax.core.settings import Settings
 from lio_jax.data.detect import open_sequence
 from lio_jax.run.run import settings_for
+from lio_jax.settings.settings import Settings
 from lio_jax.tuning.loss import Loss
 from lio_jax.tuning.objectives import Named, objective_named
 from lio_jax.tuning.optimise import Bounds
@@ -126,7 +126,7 @@ def _recordings(
     """Return the recordings, or their consecutive segments, and settings with the first one's extrinsics."""
     recordings: list[Recording] = []
     for path in paths:
-        sequence = open_sequence(path, settings.config.data)
+        sequence = open_sequence(path, settings.run.data)
         truth = truth_of(sequence, gt)
         if named.needs_truth and truth is None:
             raise UsageError(

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.timestamps import ns_to_seconds
 from lio_jax.data import pointcloud2
 from lio_jax.data.bag_files import Topic
+from lio_jax.data.config import DataConfig
 from lio_jax.data.point_time import PointTiming, TimeSample, recognise_point_time, scan_period, stamp_end
 from lio_jax.data.pointcloud2 import RawCloud, decode_pointcloud2
 from lio_jax.data.reconstruct import azimuth_time, check_beams, guess_beams, ring_from_elevation

@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError
+from lio_jax.data.config import DataConfig
 from lio_jax.data.sequence import Sequence
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.config import DataConfig
+from lio_jax.data.config import DataConfig
 from lio_jax.data.sequence import ImuData
 
 STANDARD_GRAVITY = 9.80665

@@ -10,8 +10,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError
+from lio_jax.data.config import DataConfig
 from lio_jax.data.pointcloud2 import valid_returns
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo, WarningLog
 from lio_jax.data.time_order import Stamped, in_time_order

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data import navigation_messages, pointcloud2, static_transforms
 from lio_jax.data.bag_files import (
@@ -25,6 +24,7 @@ from lio_jax.data.bag_files import (
     until_damage,
 )
 from lio_jax.data.bag_scans import decode_cloud, recognise_scans
+from lio_jax.data.config import DataConfig
 from lio_jax.data.imu_checks import accel_scale
 from lio_jax.data.navigation_messages import GpsCollector, ImuCollector
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo, WarningLog

@@ -4,8 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.params import ImuParams
 from lio_jax.core.prefix_sum import prefix_sum
+from lio_jax.imu.params import ImuParams
 
 UNKNOWN_RATE = 0.3
 """Angular rate where no sample tells it, as white noise, rad/s/sqrt(Hz): 0.1 rad after 0.1 s."""

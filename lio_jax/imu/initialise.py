@@ -20,9 +20,9 @@ from lio_jax.core.error_state import (
     sphere_basis,
 )
 from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
-from lio_jax.core.params import ImuParams, InitialParams
 from lio_jax.core.prefix_sum import running_count
 from lio_jax.core.types import ImuBatch, NavState, initial_nav_state
+from lio_jax.imu.params import ImuParams, InitialParams
 
 MIN_SAMPLES = 5
 """Fewer samples cannot show that the vehicle is at rest."""

@@ -22,9 +22,9 @@ from lio_jax.core.error_state import (
     NavEstimate,
 )
 from lio_jax.core.geometry import rotation_matrix, skew
-from lio_jax.core.params import ImuParams, InitialParams
 from lio_jax.core.types import ImuBatch, initial_nav_state
 from lio_jax.imu.initialise import levelled
+from lio_jax.imu.params import ImuParams, InitialParams
 from lio_jax.imu.preintegration import Preintegrated, preintegrate_parallel
 from lio_jax.imu.sampling import sample_intervals
 

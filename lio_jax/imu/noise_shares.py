@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lio_jax.core.error_state import BIASES
-from lio_jax.core.params import ImuParams
+from lio_jax.imu.params import ImuParams
 from lio_jax.imu.preintegration import preintegrate_parallel
 from lio_jax.imu.sampling import Intervals
 

@@ -7,10 +7,10 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from lio_jax.core.error_state import POSITION, ROTATION, VELOCITY
-from lio_jax.core.params import ImuParams
 from lio_jax.core.types import NavState
 from lio_jax.imu.discretise import discretise, process_noise
 from lio_jax.imu.increments import NAV_DOF, accumulate, nav_transition, sensitivity
+from lio_jax.imu.params import ImuParams
 from lio_jax.imu.sampling import Intervals
 
 

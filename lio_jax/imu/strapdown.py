@@ -21,10 +21,10 @@ from lio_jax.core.error_state import (
     sphere_basis,
 )
 from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
-from lio_jax.core.params import ImuParams
 from lio_jax.core.types import ImuBatch, NavState
 from lio_jax.imu.discretise import discretise, process_noise
 from lio_jax.imu.increments import NAV_DOF, Increments, accumulate, nav_transition, sensitivity
+from lio_jax.imu.params import ImuParams
 from lio_jax.imu.path import Path
 from lio_jax.imu.sampling import Intervals, sample_intervals
 from lio_jax.imu.sweep_mean_error import LAG_DOF, lag_of_durations, lag_of_inputs, still_to_show

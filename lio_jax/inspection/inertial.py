@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.config import DataConfig
+from lio_jax.data.config import DataConfig
 from lio_jax.data.imu_checks import LARGEST, accel_scale, cleaned, coverage, still_second
 from lio_jax.data.sequence import ImuData
 

@@ -6,8 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.config import LidarConfig
-from lio_jax.core.settings import Settings
 from lio_jax.data.rosbag import RosbagSequence
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.inspection.findings import Inspection, Suggestion
@@ -17,7 +15,9 @@ from lio_jax.inspection.requirements import missing
 from lio_jax.inspection.sampling import WINDOW_SCANS, Sampled, sampled
 from lio_jax.inspection.scans import ScanSummary
 from lio_jax.inspection.suspicions import suspicions
+from lio_jax.lidar.params import ScanConfig
 from lio_jax.run.fitted_settings import fitted_to_surroundings
+from lio_jax.settings.settings import Settings
 
 _TRACKED_WINDOWS = 4
 _TRACKED_SCANS = 40
@@ -179,7 +179,7 @@ def _suggestions(
             suggested.append(Suggestion("params.extrinsics.rotation", None, reason, "[X,Y,Z,W]"))
     if imu is not None and imu.in_g:
         suggested.append(Suggestion("config.data.accel_unit", "g", "|accel| is near 1 at rest"))
-    buckets = LidarConfig().buckets
+    buckets = ScanConfig().buckets
     if (largest := max(scans.counts, default=0)) > buckets[-1]:
         sizes = [*buckets, -(-largest // 65536) * 65536]
         reason = f"or scans are thinned to {buckets[-1]} points"

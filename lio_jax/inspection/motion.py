@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.settings import Settings
 from lio_jax.data.sequence import ImuData, LidarScan
 from lio_jax.run.track import CompiledStep, ScanResult, track
+from lio_jax.settings.settings import Settings
 
 THINNED_TO = 16384
 _LEAST_TURNS = 6

@@ -15,11 +15,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
-from lio_jax.core.config import Config
 from lio_jax.core.errors import UsageError
-from lio_jax.core.params import Params
 from lio_jax.core.types import Scan
 from lio_jax.core.xla import computed_once
+from lio_jax.lidar.params import Config, Params
 from lio_jax.lidar.picking import Picks, Ring, pick, sector_bounds
 from lio_jax.lidar.range_image import RangeImage, range_image
 from lio_jax.lidar.ring_voxel_mean import mean_per_ring_and_voxel

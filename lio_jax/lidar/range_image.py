@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float32, Int32
 
-from lio_jax.core.config import FeaturesConfig
-from lio_jax.core.params import Params
 from lio_jax.core.prefix_sum import counts_before
 from lio_jax.core.types import Scan
+from lio_jax.lidar.params import Params, RingConfig
 
 
 class RangeImage(eqx.Module):
@@ -34,7 +33,7 @@ class RangeImage(eqx.Module):
         return jnp.arange(self.index.shape[0], dtype=jnp.int32)[:, None] < self.count
 
 
-def range_image(config: FeaturesConfig, params: Params, scan: Scan) -> RangeImage:
+def range_image(config: RingConfig, params: Params, scan: Scan) -> RangeImage:
     """Sort a scan's points into rings.
 
     With ``order="azimuth"`` (LIO-SAM) the first point that falls into a column takes it, later ones are left
@@ -61,7 +60,7 @@ def range_image(config: FeaturesConfig, params: Params, scan: Scan) -> RangeImag
 
 
 def _by_azimuth(
-    config: FeaturesConfig, scan: Scan, place: Bool[Array, " n"], missed: Int32[Array, ""]
+    config: RingConfig, scan: Scan, place: Bool[Array, " n"], missed: Int32[Array, ""]
 ) -> RangeImage:
     rings, columns, n = config.rings, config.columns, scan.ring.shape[0]
     cell = azimuth_column(scan.points, columns) * rings + scan.ring
@@ -81,7 +80,7 @@ def _by_azimuth(
 
 
 def _by_arrival(
-    config: FeaturesConfig, scan: Scan, place: Bool[Array, " n"], missed: Int32[Array, ""]
+    config: RingConfig, scan: Scan, place: Bool[Array, " n"], missed: Int32[Array, ""]
 ) -> RangeImage:
     rings, columns = config.rings, config.columns
     rank, count = rank_within_ring(scan.ring, place, rings)
@@ -98,7 +97,7 @@ def _by_arrival(
 
 
 def _scattered(
-    target: Int32[Array, " n"], values: Int32[Array, " n"], config: FeaturesConfig
+    target: Int32[Array, " n"], values: Int32[Array, " n"], config: RingConfig
 ) -> Int32[Array, "k rings"]:
     flat = jnp.zeros(config.columns * config.rings, jnp.int32).at[target].set(values, mode="drop")
     return flat.reshape(config.columns, config.rings)

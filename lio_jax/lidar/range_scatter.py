@@ -4,8 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.params import Params
 from lio_jax.core.types import Scan
+from lio_jax.lidar.params import Params
 
 _APART = (1e-5, 0.025)
 """Angles between neighbours of a ring, rad: closer ones are returns of one pulse, others have lost neighbours

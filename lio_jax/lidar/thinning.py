@@ -5,10 +5,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.hashing import voxel_hash
-from lio_jax.core.params import Params
 from lio_jax.core.prefix_sum import running_count
 from lio_jax.core.types import Scan
 from lio_jax.core.xla import computed_once
+from lio_jax.lidar.params import Params
 
 
 class Selection(eqx.Module):

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from lio_jax.core.pose_covariance import carried
-from lio_jax.core.settings import Settings
 from lio_jax.loops.closing import held_by
 from lio_jax.loops.gps import Fix, GpsGate, Refusal, alignment
 from lio_jax.loops.keyframe import Keyframe
+from lio_jax.loops.params import BackEndSettings
 from lio_jax.loops.verification import Verdict
 from lio_jax.pose_graph.graduated import Robust
 from lio_jax.pose_graph.graph import (
@@ -227,7 +227,7 @@ class FindsLoops(Protocol):
 class BackEnd:
     """Takes keyframes in order."""
 
-    def __init__(self, settings: Settings, closer: FindsLoops | None, gate: GpsGate | None) -> None:
+    def __init__(self, settings: BackEndSettings, closer: FindsLoops | None, gate: GpsGate | None) -> None:
         """Begin without keyframes.
 
         Args:

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.settings import Settings
 from lio_jax.loops.consistency import Consensus, consistent
 from lio_jax.loops.keyframe import Keyframe
+from lio_jax.loops.params import BackEndSettings
 from lio_jax.loops.place_descriptor import Places
 from lio_jax.loops.proposals import (
     AT_LEAST,
@@ -37,7 +37,7 @@ class LoopCloser:
     made of.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: BackEndSettings) -> None:
         """Begin with no keyframe.
 
         Args:
@@ -46,7 +46,7 @@ class LoopCloser:
         Raises:
             LioJaxError: the file of pairs cannot be read or holds something else.
         """
-        sizes, limits = settings.config.loops, settings.values["loop"]
+        sizes, limits = settings.run.loops, settings.values["loop"]
         self._settings, self._limits = settings, limits
         self._places = Places(sizes.rings, sizes.sectors, limits["descriptor_range"])
         self._consensus = Consensus(limits)

@@ -5,7 +5,7 @@ maximization for robust multi-robot map merging", ICRA 2018), decided as the loo
 other are compared, whose circle holds so little odometry that drift says next to nothing.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ _SUPPORT = 2
 class Consensus:
     """Verified loops: those in the graph, and those that wait for others."""
 
-    def __init__(self, limits: dict[str, Any]) -> None:
+    def __init__(self, limits: Mapping[str, Any]) -> None:
         """Begin with none.
 
         Args:
@@ -78,7 +78,7 @@ def consistent(
     b: Verdict,
     keyframes: Sequence[Keyframe],
     run: NDArray[np.float64],
-    limits: dict[str, Any],
+    limits: Mapping[str, Any],
 ) -> bool:
     """Return whether two loops and the odometry between their ends make a circle that closes.
 

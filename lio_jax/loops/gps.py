@@ -208,7 +208,7 @@ class GpsGate:
             stamp_ns: (m,) ascending.
             position: (m, 3) m, east north up, of the antenna.
             covariance: (m, 3, 3) m^2, positive definite.
-            values: numbers of :class:`lio_jax.core.backend_params.GpsParams` by name.
+            values: numbers of :class:`lio_jax.loops.params.GpsParams` by name.
             elevation: whether the fixes' height counts; false: the height is that of the keyframe's pose.
         """
         self._stamp_ns, self._position, self._covariance = stamp_ns, position, covariance

@@ -2,7 +2,7 @@
 
 import math
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -35,7 +35,7 @@ AT_LEAST = Error(np.array(1.0), np.array(0.1))
 """What is possible however short the way: the keyframes' clouds are thinned."""
 
 
-def possible_error(metres: NDArray[np.float64] | float, limits: dict[str, Any]) -> Error:
+def possible_error(metres: NDArray[np.float64] | float, limits: Mapping[str, Any]) -> Error:
     """Return how wrong relative poses may be after so many metres of odometry.
 
     Args:
@@ -208,7 +208,7 @@ def nearest_proposal(
     poses: NDArray[np.float64],
     old: NDArray[np.bool_],
     metres: NDArray[np.float64],
-    limits: dict[str, Any],
+    limits: Mapping[str, Any],
 ) -> list[Proposal]:
     """Return the newest keyframe with the nearest old one, if there is one within the radius.
 
@@ -238,7 +238,7 @@ def external_proposal(
     T_target_source: NDArray[np.float64] | None,
     poses: NDArray[np.float64],
     metres: float,
-    limits: dict[str, Any],
+    limits: Mapping[str, Any],
 ) -> Proposal:
     """Return two keyframes that something else proposed.
 
@@ -263,7 +263,7 @@ def described_proposals(
     poses: NDArray[np.float64],
     old: NDArray[np.bool_],
     metres: NDArray[np.float64],
-    limits: dict[str, Any],
+    limits: Mapping[str, Any],
 ) -> list[Proposal]:
     """Return the newest keyframe with the old one that looks most alike, where drift may hide its distance.
 

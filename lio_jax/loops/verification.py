@@ -6,7 +6,7 @@ the scan saw through, no direction is left open and no other fit comes near it. 
 that repeat themselves.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -17,13 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.param_values import DEFAULTS
-from lio_jax.core.params import Params, default_params
-from lio_jax.core.settings import Settings
+from lio_jax.core.leaf import numbers_of, traced
 from lio_jax.core.types import state_dtype
 from lio_jax.loops.alignment import aligned
 from lio_jax.loops.keyframe import Keyframe, level_points, padded, thinned
 from lio_jax.loops.overlap import LEAST_POINTS, Candidate, Comparison, conflict
+from lio_jax.loops.params import AlignmentParams, BackEndSettings
 from lio_jax.loops.plan_view import SOURCE_REACH, TARGET_REACH, Fits, fits, upright_cells
 from lio_jax.loops.proposals import Proposal, is_old, possible_error
 from lio_jax.pose_graph.graph import heading_of
@@ -32,6 +31,8 @@ _Array = NDArray[np.float64]
 
 _SPACING = 0.4
 """Of the points that are aligned, m."""
+_SCALE: float = numbers_of(AlignmentParams)["registration"]["information_scale"]
+"""Share of the information that is believed where the recipe declares none."""
 _OTHER_FIT = (2.0, 0.15)
 """Two fits are not the same if they are farther apart than this, m and rad."""
 
@@ -58,7 +59,9 @@ class Verdict:
     """Points that agree with the best other fit, as a share of those that agree with this one."""
 
 
-def verify(proposal: Proposal, keyframes: Sequence[Keyframe], poses: _Array, settings: Settings) -> Verdict:
+def verify(
+    proposal: Proposal, keyframes: Sequence[Keyframe], poses: _Array, settings: BackEndSettings
+) -> Verdict:
     """Return whether a proposed loop holds.
 
     Args:
@@ -67,7 +70,8 @@ def verify(proposal: Proposal, keyframes: Sequence[Keyframe], poses: _Array, set
         poses: (k, 4, 4) their T_world_imu, corrected so far.
         settings: ``config.loops`` and ``params.loop``.
     """
-    limits, sizes = settings.values["loop"], settings.config.loops
+    limits, sizes = settings.values["loop"], settings.run.loops
+    scale = settings.values["registration"].get("information_scale", _SCALE)
     source, target = proposal.source, proposal.target
     if proposal.twin is not None:
         return refused(proposal, f"keyframe {proposal.twin}, where it cannot be, looks as much alike")
@@ -110,7 +114,7 @@ def verify(proposal: Proposal, keyframes: Sequence[Keyframe], poses: _Array, set
     def conflicting(T: _Array) -> float:
         return conflict(seen, theirs[their_upright], T)
 
-    return _judged(proposal, candidates, conflicting, poses[[target, source]], limits)
+    return _judged(proposal, candidates, conflicting, poses[[target, source]], limits, scale)
 
 
 def _judged(
@@ -118,7 +122,8 @@ def _judged(
     candidates: list[Candidate],
     conflicting: Callable[[_Array], float],
     poses: _Array,
-    limits: dict[str, Any],
+    limits: Mapping[str, Any],
+    scale: float,
 ) -> Verdict:
     error = possible_error(proposal.metres, limits)
     if not candidates:
@@ -161,7 +166,7 @@ def _judged(
     to_body = np.kron(np.eye(2), poses[1, :3, :3])
     information = np.zeros((6, 6))
     if not reason:
-        information = _believed(to_body.T @ best.information @ to_body, limits)
+        information = _believed(to_body.T @ best.information @ to_body, limits, scale)
     left, right = np.eye(4), np.eye(4)
     left[:3, :3], right[:3, :3] = poses[0, :3, :3].T, poses[1, :3, :3]
     return Verdict(
@@ -182,9 +187,8 @@ def refused(proposal: Proposal, reason: str) -> Verdict:
     return Verdict(proposal, False, reason, proposal.T_target_source, np.zeros((6, 6)))
 
 
-def _believed(information: _Array, limits: dict[str, Any]) -> _Array:
+def _believed(information: _Array, limits: Mapping[str, Any], scale: float) -> _Array:
     """Return the information that is left where neighbouring points share the map's error."""
-    scale = DEFAULTS["registration"]["information_scale"]
     sigmas = np.repeat([limits["rotation_sigma"], limits["translation_sigma"]], 3)
     believed = np.linalg.inv(np.linalg.inv(scale * information) + np.diag(sigmas**2))
     return (believed + believed.T) / 2
@@ -214,10 +218,10 @@ def _guesses(found: Fits, targets: _Array) -> _Array:
 
 
 @cache
-def _params(voxel_size: float, dtype: jnp.dtype) -> Params:
+def _params(voxel_size: float, dtype: jnp.dtype) -> AlignmentParams:
     """Return parameters of the alignment, which is the same whatever the recipe."""
     size = jnp.asarray(voxel_size, dtype)
-    return eqx.tree_at(lambda params: params.map.voxel_size, default_params(), size)
+    return eqx.tree_at(lambda params: params.map.voxel_size, traced(AlignmentParams), size)
 
 
 def _wrapped(angle: float) -> float:

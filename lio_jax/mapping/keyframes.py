@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
-from lio_jax.core.params import SubmapParams
 from lio_jax.core.xla import computed_once
+from lio_jax.mapping.params import SubmapParams
 
 
 class KeyframeCloud(eqx.Module):

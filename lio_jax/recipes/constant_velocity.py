@@ -7,12 +7,12 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from lio_jax.core.error_state import DOF, VELOCITY, NavEstimate, SweptState
-from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan, initial_nav_state
 from lio_jax.imu.discretise import UNKNOWN_ACCEL, UNKNOWN_RATE
 from lio_jax.imu.initialise import MOVING_SPEED
 from lio_jax.imu.path import Path
 from lio_jax.recipes.inertial_filter import predicted
+from lio_jax.recipes.params import InertialParams
 
 _SAMPLES = 9
 """Imagined between two scans: the unknown acceleration is white over the pieces. Constant over the whole
@@ -21,7 +21,7 @@ _WEIGHTLESS = 1e-9
 """Share of gravity that is left: none at all would have no direction."""
 
 
-def unlevelled_start(params: Params) -> NavEstimate:
+def unlevelled_start(params: InertialParams) -> NavEstimate:
     """Return the state at the world's origin, with its first pose as the world's axes and any velocity."""
     nav = initial_nav_state(params.extrinsics.T_imu_lidar())
     # nothing tells biases, gravity or the extrinsic from the motion: they stay as they are
@@ -58,7 +58,7 @@ def mean_rate(last: NavState, nav: NavState, scan: Scan) -> Float[Array, "3"]:
 
 
 def predicted_without_samples(
-    params: Params, last: NavEstimate, rate: Float[Array, "3"], scan: Scan, first: Bool[Array, ""]
+    params: InertialParams, last: NavEstimate, rate: Float[Array, "3"], scan: Scan, first: Bool[Array, ""]
 ) -> tuple[SweptState, Path]:
     """Return the state at the scan's end and the motion since the last one's if the body went on as it moved.
 

@@ -1,9 +1,11 @@
 """The default recipe: tightly coupled with inertial samples, LiDAR odometry where there are none."""
 
-from lio_jax.core.config import Config
-from lio_jax.core.params import Params
+from collections.abc import Mapping
+from typing import ClassVar
+
 from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.recipes import lidar_inertial, lidar_odometry
+from lio_jax.recipes.default_params import Config, Params
 from lio_jax.recipes.output import Output
 from lio_jax.recipes.recipe import Recipe
 
@@ -12,6 +14,18 @@ State = lidar_inertial.State | lidar_odometry.State
 
 class Default(Recipe[Config, Params, State]):
     """The project's own recipe: Gauss-Newton or an iterated filter on the planes of a voxel map."""
+
+    config_type = Config
+    params_type = Params
+    # with the values for streets, voxels hold more than one wall: on 20 s of walking in a simulated office
+    # the trajectory's error was 32 mm instead of 7 mm
+    near_values: ClassVar[Mapping[str, float]] = {
+        "params.lidar.min_range": 0.5,
+        "params.map.voxel_size": 0.4,
+        "params.map.point_spacing": 0.1,
+        "params.registration.point_spacing": 0.2,
+        "params.registration.inertial_point_spacing": 0.2,
+    }
 
     def init(self, params: Params, imu: ImuBatch | None = None) -> State:
         """Return the state before the first scan; its form says whether there are inertial samples."""

@@ -7,6 +7,7 @@ Xu, Cai, He, Lin & Zhang, "FAST-LIO2: Fast direct LiDAR-inertial odometry", T-RO
 ``recipe_settings("fast_lio2")``. Without inertial samples the velocity is taken as constant.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -14,14 +15,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.config import Config
 from lio_jax.core.error_state import NavEstimate
-from lio_jax.core.params import Params
+from lio_jax.core.leaf import section, static
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
 from lio_jax.estimation.pose_measurement import keep_observed
+from lio_jax.imu.params import ImuParams, InitialParams
 from lio_jax.imu.path import deskew_along
+from lio_jax.lidar.params import LidarParams, ScanConfig
 from lio_jax.lidar.thinning import mean_per_voxel
+from lio_jax.mapping.params import MapConfig, MapParams, MovingCubeParams
 from lio_jax.mapping.point_map import EDGE, PointMap, empty_map, insert, move_cube
 from lio_jax.mapping.voxel_map import anchor_of
 from lio_jax.recipes import recipe
@@ -42,10 +45,100 @@ from lio_jax.recipes.inertial_filter import (
     registration_of,
 )
 from lio_jax.recipes.output import Output
+from lio_jax.recipes.params import InertialConfig, InertialParams
 from lio_jax.recipes.recipe import Needs, Recipe
 from lio_jax.registration.association import Association, associated, no_association
 from lio_jax.registration.knn_planes import Planes, associate, linearise, no_planes
+from lio_jax.registration.params import (
+    FilterMatch,
+    KnnConfig,
+    RegistrationConfig,
+    ScoredFitParams,
+    ThinnedMatch,
+)
 from lio_jax.registration.voxel_plane_icp import Frame
+
+_GYR_COV, _ACC_COV, _B_GYR_COV, _B_ACC_COV = 0.1, 0.1, 1e-4, 1e-4
+IMU_RATE = 200.0
+"""Rate of the inertial samples of FAST-LIO2's example recordings, Hz."""
+
+
+def density_of(cov: float) -> float:
+    """Return the density that stands for one of FAST-LIO2's covariances, of white noise or of a bias walk.
+
+    FAST-LIO2 adds cov dt^2 to its covariance in each step of dt = 1 / rate; a density s adds s^2 dt. So
+    s = sqrt(cov / rate).
+    """
+    return (cov / IMU_RATE) ** 0.5
+
+
+class Match(FilterMatch, ThinnedMatch):
+    """A match of the thinned scan in the filter."""
+
+
+class Params(InertialParams):
+    """Traced parameters of FAST-LIO2, in SI units."""
+
+    imu: ImuParams = section(
+        ImuParams,
+        gyro_noise=density_of(_GYR_COV),
+        accel_noise=density_of(_ACC_COV),
+        gyro_bias_walk=density_of(_B_GYR_COV),
+        accel_bias_walk=density_of(_B_ACC_COV),
+    )
+    # square roots of its first variances: 1, 1, 1e-4, 1e-3, 1e-5, 1e-5 and 1e-5
+    initial: InitialParams = section(
+        InitialParams,
+        rotation_sigma=1.0,
+        velocity_sigma=1.0,
+        gyro_bias_sigma=1e-2,
+        accel_bias_sigma=1e-3**0.5,
+        gravity_sigma=1e-5**0.5,
+        extrinsic_rotation_sigma=1e-5**0.5,
+        extrinsic_translation_sigma=1e-5**0.5,
+    )
+    # its variance of a point's distance from its plane is 1e-3 m^2
+    lidar: LidarParams = section(LidarParams, range_sigma=1e-3**0.5)
+    map: MapParams = section(MapParams, voxel_size=0.5)
+    registration: Match = section(
+        Match,
+        point_spacing=0.5,
+        information_scale=1.0,
+        reassociation_distance=0.01,
+        rotation_tolerance=1e-3,
+        translation_tolerance=1e-3,
+        inertial_degeneracy_ratio=0.0,
+    )
+    knn: ScoredFitParams = section(ScoredFitParams)
+    point_map: MovingCubeParams = section(MovingCubeParams)
+
+
+@dataclass(frozen=True)
+class ThinnedScanConfig(ScanConfig):
+    """Capacity of the thinned scan."""
+
+    registration_points: int = static(4096, above=0)
+    """Capacity of the downsampled scan that is registered and written into the map."""
+
+
+@dataclass(frozen=True)
+class FilterConfig:
+    """Choice of raw points."""
+
+    point_filter_num: int = static(3, above=0)
+    """One point of so many is used, counted in the recording's order. A divisor of the number of beams would
+    leave whole beams out where the points of a firing follow each other."""
+
+
+@dataclass(frozen=True)
+class Config(InertialConfig):
+    """Static settings of FAST-LIO2."""
+
+    lidar: ThinnedScanConfig = section(ThinnedScanConfig)
+    map: MapConfig = section(MapConfig, capacity=65536)
+    registration: RegistrationConfig = section(RegistrationConfig, max_iterations=4)
+    knn: KnnConfig = section(KnnConfig)
+    fast_lio2: FilterConfig = section(FilterConfig)
 
 
 class State(recipe.State):
@@ -77,6 +170,8 @@ class FastLio2(Recipe[Config, Params, State]):
     """FAST-LIO2."""
 
     needs = Needs()
+    config_type = Config
+    params_type = Params
 
     def init(self, params: Params, imu: ImuBatch | None = None) -> State:
         """Return the state before the first scan: at the world's origin.

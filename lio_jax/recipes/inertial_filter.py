@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.config import Config
 from lio_jax.core.error_state import (
     DOF,
     EXTRINSIC_ROTATION,
@@ -22,7 +21,6 @@ from lio_jax.core.error_state import (
     sphere_basis,
 )
 from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
-from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import Measurement, Update
 from lio_jax.estimation.nav_update import predicted_pose_covariance, update_nav
@@ -30,11 +28,12 @@ from lio_jax.imu.initialise import initialise_at_rest
 from lio_jax.imu.path import Path
 from lio_jax.imu.strapdown import propagate_sweep
 from lio_jax.recipes.output import Evidence
+from lio_jax.recipes.params import InertialParams, RecipeConfig
 from lio_jax.registration.gauss_newton import NormalEquations, Registration
 from lio_jax.registration.point_evidence import PointEvidence
 
 
-def levelled_start(params: Params, imu: ImuBatch) -> NavEstimate:
+def levelled_start(params: InertialParams, imu: ImuBatch) -> NavEstimate:
     """Return the state at the world's origin, levelled by the samples, as if the vehicle were at rest.
 
     Args:
@@ -74,7 +73,7 @@ def held_at_lidar(state: NavEstimate) -> NavEstimate:
 
 
 def predicted(
-    params: Params,
+    params: InertialParams,
     last: NavEstimate,
     scan: Scan,
     imu: ImuBatch,
@@ -131,7 +130,7 @@ class ScanMatch(Protocol):
 
 
 def corrected(
-    config: Config, params: Params, prior: SweptState, scan_match: ScanMatch, before: Any
+    config: RecipeConfig, params: InertialParams, prior: SweptState, scan_match: ScanMatch, before: Any
 ) -> tuple[Update, NavState]:
     """Return the update by a scan match, and the state with the pose at which the scan lies on the map.
 

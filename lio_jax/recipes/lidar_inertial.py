@@ -10,10 +10,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.config import Config
 from lio_jax.core.error_state import NavEstimate
 from lio_jax.core.implicit import with_derivative_of
-from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
 from lio_jax.estimation.map_drift import MapDrift
@@ -22,6 +20,7 @@ from lio_jax.imu.path import Path, deskew_along
 from lio_jax.lidar.thinning import ThinnedScan, thinned
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
 from lio_jax.recipes import recipe
+from lio_jax.recipes.default_params import Config, Params
 from lio_jax.recipes.inertial_filter import (
     Linearised,
     corrected,

@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.config import Config
-from lio_jax.core.params import Params
 from lio_jax.core.types import NavState, Scan, initial_nav_state
 from lio_jax.lidar.deskew import deskew_constant_velocity
 from lio_jax.lidar.thinning import thinned
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
 from lio_jax.recipes import recipe
+from lio_jax.recipes.default_params import Config, Params
 from lio_jax.recipes.output import Output
 from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES
 from lio_jax.registration.voxel_plane_icp import Frame, register

@@ -10,7 +10,8 @@ mapping", IROS 2020, in its program's form; a sliding window takes ISAM2's place
 """
 
 import dataclasses
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -18,11 +19,9 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int32
 
-from lio_jax.core.config import Config
 from lio_jax.core.error_state import DOF as NAV_DOF
 from lio_jax.core.errors import UsageError
 from lio_jax.core.geometry import from_blocks
-from lio_jax.core.params import Params
 from lio_jax.core.types import ImuBatch, NavState, Scan, state_dtype
 from lio_jax.estimation.chain import information_of, linearise
 from lio_jax.estimation.marginal_likelihood import log_evidence
@@ -43,6 +42,7 @@ from lio_jax.lidar.features import (
 from lio_jax.mapping.keyframes import is_due, no_keyframes
 from lio_jax.recipes import recipe
 from lio_jax.recipes.inertial_filter import levelled_start, lidar_pose
+from lio_jax.recipes.lio_sam_params import Config, Params
 from lio_jax.recipes.output import Output
 from lio_jax.recipes.pose_limits import drawn_to_tilt, measured_attitude, within_limits
 from lio_jax.recipes.recipe import Needs, Recipe
@@ -87,6 +87,13 @@ class LioSam(Recipe[Config, Params, State]):
     """LIO-SAM without its back end."""
 
     needs = Needs(imu="required", rings=True)
+    config_type = Config
+    params_type = Params
+    given_values: ClassVar[Mapping[str, Any]] = {
+        "config.backend.gps_elevation": False,
+        "params.gps.pose_variance": 25.0,
+        "params.gps.max_variance": 2.0,
+    }
 
     def init(self, params: Params, imu: ImuBatch | None = None) -> State:
         """Return the state before the first scan: at the world's origin, levelled, with an empty map.
@@ -255,6 +262,7 @@ class LioSam(Recipe[Config, Params, State]):
             log_evidence=log_evidence(window.chain, smoothed),
             corners=jnp.arange(corners + surfaces) < corners,
             restarted=failed,
+            smoother_unfinished=unfinished,
         )
 
 

@@ -9,6 +9,7 @@ Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014. Its va
 """
 
 import dataclasses
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -16,8 +17,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.config import Config
-from lio_jax.core.params import Params
+from lio_jax.core.leaf import section, static
 from lio_jax.core.types import ImuBatch, NavState, Scan, initial_nav_state
 from lio_jax.lidar.deskew import deskew_constant_velocity
 from lio_jax.lidar.features import (
@@ -28,15 +28,81 @@ from lio_jax.lidar.features import (
     loam_features,
     thinned_features,
 )
+from lio_jax.lidar.params import LidarParams, LoamFeatureParams, LoamRingConfig
+from lio_jax.mapping.params import CubeGridParams, FeatureMapParams, MapConfig, PointMapParams
 from lio_jax.recipes import recipe
 from lio_jax.recipes.output import Output
+from lio_jax.recipes.params import RecipeConfig, RecipeParams
 from lio_jax.recipes.recipe import Needs, Recipe
 from lio_jax.registration.cube_map import ScanToCubes, added_to
 from lio_jax.registration.feature_icp import register_features
 from lio_jax.registration.feature_map import FeatureMap, empty_feature_map, frames_at, placed_in
 from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES, Registration
 from lio_jax.registration.lines_and_planes import FeaturePoints
+from lio_jax.registration.params import (
+    GaussNewtonMatch,
+    KnnConfig,
+    LineFitParams,
+    RegistrationConfig,
+    RobustMatch,
+    ScanToScanParams,
+)
 from lio_jax.registration.scan_to_scan import LastScan, ScanToScan, empty_scan, last_scan
+
+
+class Match(GaussNewtonMatch, RobustMatch):
+    """A match of features by Gauss-Newton."""
+
+
+class Params(RecipeParams):
+    """Traced parameters of A-LOAM, in SI units."""
+
+    lidar: LidarParams = section(LidarParams, min_range=0.3)
+    map: FeatureMapParams = section(FeatureMapParams, voxel_size=0.8, corner_voxel_size=0.4)
+    registration: Match = section(
+        Match,
+        kernel=0.1,
+        reassociation_distance=0.05,
+        rotation_tolerance=1e-3,
+        translation_tolerance=1e-3,
+        degeneracy_ratio=1e-4,
+    )
+    scan_to_scan: ScanToScanParams = section(ScanToScanParams)
+    knn: LineFitParams = section(LineFitParams, radius=1.0, plane_tolerance=0.2)
+    features: LoamFeatureParams = section(LoamFeatureParams)
+    point_map: PointMapParams = section(PointMapParams)
+    cubes: CubeGridParams = section(CubeGridParams)
+
+
+@dataclass(frozen=True)
+class LoamConfig:
+    """Rounds and capacities."""
+
+    rounds: int = static(2, above=0)
+    """How often the matches of a scan are searched. After each search at most
+    ``config.registration.max_iterations`` steps follow."""
+    opening_rounds: int = static(15, above=0)
+    """How often matches are searched between the first two scans, where no velocity is known; it replaces
+    ``rounds`` there."""
+    compensate: bool = static(True)
+    """Compensate the motion within a scan, as the pose under trial implies it."""
+    mapping_every: int = static(1, above=0)
+    """One scan of so many is matched with the map and added to it."""
+    corner_points: int = static(4096, above=0)
+    """Capacity of the corners that are matched with the map, after thinning."""
+    surface_points: int = static(8192, above=0)
+    """Capacity of the surface points that are matched with the map, after thinning."""
+
+
+@dataclass(frozen=True)
+class Config(RecipeConfig):
+    """Static settings of A-LOAM."""
+
+    map: MapConfig = section(MapConfig, capacity=65536)
+    registration: RegistrationConfig = section(RegistrationConfig, max_iterations=4)
+    knn: KnnConfig = section(KnnConfig)
+    features: LoamRingConfig = section(LoamRingConfig, rings=0, columns=0, surface_points=0)
+    loam: LoamConfig = section(LoamConfig)
 
 
 class Targets(eqx.Module):
@@ -73,6 +139,8 @@ class Loam(Recipe[Config, Params, State]):
     """LOAM as A-LOAM implements it."""
 
     needs = Needs(imu="unused", rings=True)
+    config_type = Config
+    params_type = Params
 
     def init(self, params: Params, imu: ImuBatch | None = None) -> State:
         """Return the state before the first scan: at the world's origin, with an empty map.

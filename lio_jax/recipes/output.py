@@ -54,3 +54,6 @@ class Output(eqx.Module):
     """Log marginal likelihood of all measurements since the smoother began; None from recipes without one."""
     restarted: Bool[Array, ""] | None = None
     """The smoother ran away and began anew; None from recipes without one."""
+    smoother_unfinished: Bool[Array, ""] | None = None
+    """The match converged, and the smoother reached its largest number of linearisations; None from recipes
+    without one."""

@@ -5,8 +5,8 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from lio_jax.core.geometry import rotation_matrix
-from lio_jax.core.params import SmootherParams
 from lio_jax.core.types import ImuBatch
+from lio_jax.estimation.params import SmootherParams
 
 
 def drawn_to_tilt(T_world_imu: jaxlie.SE3, R_world_imu: jaxlie.SO3, weight: Float[Array, ""]) -> jaxlie.SE3:

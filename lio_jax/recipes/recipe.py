@@ -1,6 +1,7 @@
 """What a recipe is: a static config, traced parameters, and two pure functions from scan to scan."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
@@ -8,6 +9,7 @@ import equinox as eqx
 
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.recipes.output import Output
+from lio_jax.recipes.params import RecipeConfig, RecipeParams
 
 
 class State(eqx.Module):
@@ -39,8 +41,8 @@ class Needs:
     """The motion within a sweep is compensated where the points have times."""
 
 
-C = TypeVar("C")
-P = TypeVar("P")
+C = TypeVar("C", bound=RecipeConfig)
+P = TypeVar("P", bound=RecipeParams)
 S = TypeVar("S", bound=State)
 
 
@@ -55,7 +57,16 @@ class Recipe(ABC, Generic[C, P, S]):
     config: C
     """Static settings: what shapes arrays or chooses code."""
 
+    config_type: ClassVar[type]
+    """Class of ``config``: a tree of sections, see :mod:`lio_jax.core.leaf`."""
+    params_type: ClassVar[type]
+    """Class of the traced parameters that ``init`` and ``step`` take."""
     needs: ClassVar[Needs] = Needs()
+    near_values: ClassVar[Mapping[str, float]] = {}
+    """Values by path that replace the defaults where a recording's surroundings are near, m; none: the recipe
+    has one set of values for all surroundings."""
+    given_values: ClassVar[Mapping[str, Any]] = {}
+    """Values by path in which the recipe differs from the defaults of the back end and of the runner."""
 
     @abstractmethod
     def init(self, params: P, imu: ImuBatch | None = None) -> S:

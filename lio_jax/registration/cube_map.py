@@ -7,11 +7,11 @@ grid decides what is kept and what is matched.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.params import Params
 from lio_jax.mapping.point_map import Insertion, PointMap, shift_box
 from lio_jax.registration import feature_map
 from lio_jax.registration.feature_map import FeatureMap
 from lio_jax.registration.lines_and_planes import FeaturePoints, Frames
+from lio_jax.registration.params import Params
 from lio_jax.registration.voxel_plane_icp import Frame
 
 

@@ -12,7 +12,6 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.implicit import Problem, Solution, implicit
-from lio_jax.core.params import Params
 from lio_jax.registration.association import Association, associated, no_association
 from lio_jax.registration.gauss_newton import (
     Directions,
@@ -33,6 +32,7 @@ from lio_jax.registration.lines_and_planes import (
     linearise,
     no_lines_and_planes,
 )
+from lio_jax.registration.params import Params
 
 
 class ScanRegistration(eqx.Module):

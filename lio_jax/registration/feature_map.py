@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.params import Params
 from lio_jax.mapping.point_map import EDGE, Insertion, PointMap, empty_map, insert
 from lio_jax.mapping.voxel_map import anchor_of
 from lio_jax.registration.feature_icp import ScanRegistration
 from lio_jax.registration.knn_planes import planes_near
 from lio_jax.registration.lines_and_planes import FeaturePoints, Frames, LinesAndPlanes, lines_near
+from lio_jax.registration.params import Params
 from lio_jax.registration.voxel_plane_icp import Frame
 
 

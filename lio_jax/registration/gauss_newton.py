@@ -10,7 +10,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.geometry import rotation_matrix
-from lio_jax.core.params import RegistrationParams
+from lio_jax.registration.params import RegistrationParams
 
 CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES = 0, 1, 2
 """Status codes of a solve."""

@@ -6,11 +6,11 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.geometry import eigenvalues_and_normal3
-from lio_jax.core.params import KnnParams, Params
 from lio_jax.core.xla import computed_once
 from lio_jax.mapping.nearest_points import nearest_points
 from lio_jax.mapping.point_map import PointMap
 from lio_jax.registration.gauss_newton import NormalEquations
+from lio_jax.registration.params import Params, ScoredFitParams
 from lio_jax.registration.voxel_plane_icp import Frame
 
 _Coordinates = Float32[Array, "n k"]
@@ -57,7 +57,7 @@ def planes_near(
     mask: Bool[Array, " k"],
     anchor: Int32[Array, "3"],
     voxel_size: Float[Array, ""],
-    knn: KnnParams,
+    knn: ScoredFitParams,
     neighbours: int,
 ) -> Planes:
     """Return the planes of :func:`associate` for points in the frame anchored at ``anchor``, m."""
@@ -136,7 +136,7 @@ def spread(
 
 
 def match_score(
-    distance: Float[Array, " k"], range_squared: Float[Array, " k"], knn: KnnParams
+    distance: Float[Array, " k"], range_squared: Float[Array, " k"], knn: ScoredFitParams
 ) -> Float[Array, " k"]:
     """Return 1 - w d / sqrt(r) of points at ranges r and distances d from their planes, m (w: ``knn``'s)."""
     return (

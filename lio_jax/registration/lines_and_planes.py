@@ -13,11 +13,11 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.geometry import across, eigenvalues_and_normal3
-from lio_jax.core.params import KnnParams
 from lio_jax.core.xla import computed_once
 from lio_jax.mapping.point_map import PointMap
 from lio_jax.registration.gauss_newton import NormalEquations
 from lio_jax.registration.knn_planes import Planes, match_score, neighbours_within, no_planes, spread
+from lio_jax.registration.params import Any
 from lio_jax.registration.voxel_plane_icp import Frame
 
 _Coordinates = Float32[Array, "n k"]
@@ -105,7 +105,7 @@ def lines_near(
     mask: Bool[Array, " k"],
     anchor: Int32[Array, "3"],
     voxel_size: Float[Array, ""],
-    knn: KnnParams,
+    knn: Any,
     neighbours: int,
 ) -> Lines:
     """Return the line through the nearest map points of each point.
@@ -150,7 +150,7 @@ def huber(kernel: Float[Array, ""]) -> Weights:
     return Weights(weight, weight)
 
 
-def scored(knn: KnnParams) -> Weights:
+def scored(knn: Any) -> Weights:
     """Return LIO-SAM's weights: the squared score s of a match, or 0 where it is not above ``min_score``.
 
     s = 1 - w d for a corner and 1 - w d / sqrt(r) for a surface point at range r (``distance_weight`` w); it

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from lio_jax.core.params import Params
+from lio_jax.registration.params import Params
 from lio_jax.registration.point_sums import point_sums
 from lio_jax.registration.voxel_plane_icp import (
     Frame,

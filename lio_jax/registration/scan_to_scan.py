@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float32
 
-from lio_jax.core.params import Params
 from lio_jax.core.xla import computed_once
 from lio_jax.lidar.features import FeatureCloud
 from lio_jax.registration.feature_icp import ScanRegistration
@@ -23,6 +22,7 @@ from lio_jax.registration.lines_and_planes import (
     LinesAndPlanes,
     line_through,
 )
+from lio_jax.registration.params import Params
 from lio_jax.registration.ring_index import Nearest, Queries, RingIndex, nearest_by_ring, ring_index
 from lio_jax.registration.voxel_plane_icp import Frame
 

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.params import Params
 from lio_jax.mapping.keyframes import KeyframeCloud, Keyframes, next_to_enter, with_keyframe
 from lio_jax.mapping.point_map import Insertion, PointMap, move_cube
 from lio_jax.registration import feature_map
 from lio_jax.registration.feature_map import FeatureMap, frames_at, placed_in
 from lio_jax.registration.lines_and_planes import FeaturePoints, Frames, Weights, scored
+from lio_jax.registration.params import Params
 from lio_jax.registration.voxel_plane_icp import Frame
 
 

@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.geometry import rotation_matrix
 from lio_jax.core.implicit import Problem, Solution, implicit
-from lio_jax.core.params import Params
 from lio_jax.core.xla import computed_once
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, query_nearest
 from lio_jax.registration.association import Association, associated, no_association
@@ -25,6 +24,7 @@ from lio_jax.registration.gauss_newton import (
     registration_at,
     unmet,
 )
+from lio_jax.registration.params import Params
 from lio_jax.registration.point_sums import point_sums
 
 

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.settings import Settings
 from lio_jax.core.types import ImuBatch
 from lio_jax.estimation.iterated_filter import NOT_FINITE
 from lio_jax.imu.sampling import LONGEST_GAP
 from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT
+from lio_jax.settings.settings import Settings
 
 _NAMED = 0.8
 """Share of an axis that must lie in the unobserved directions to name them after it."""
@@ -116,6 +116,8 @@ class Evidence:
     """Longest time without an inertial sample since then, s; None where none are used."""
     restarted: bool = False
     """The smoother ran away and began anew."""
+    smoother_unfinished: bool = False
+    """The smoother reached its largest number of linearisations."""
 
 
 def failure_of(now: Evidence, before: Evidence | None, settings: Settings) -> str:
@@ -184,9 +186,8 @@ def _match_failure(now: Evidence, settings: Settings) -> str:
         )
     if found.status == ITERATION_LIMIT:
         limit = settings.config.registration.max_iterations
-        if settings.recipe == "lio_sam" and found.iterations < limit:
-            limit = settings.config.lio_sam.smoother_iterations
-            return f"the smoother did not converge in {limit} iterations; its last states were kept."
+        if now.smoother_unfinished:
+            return "the smoother did not converge within its iterations; its last states were kept."
         return f"registration did not converge in {limit} iterations; its last pose was kept."
     # too few matches without being lost: the scan that starts the map
     if found.status == CONVERGED and (weak := int(found.degenerate.sum())):

@@ -3,13 +3,15 @@
 import dataclasses
 from collections.abc import Iterable
 from itertools import islice
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.config import FeaturesConfig
-from lio_jax.core.settings import Settings
 from lio_jax.data.sequence import LidarScan, Sequence
+from lio_jax.lidar.params import RingConfig
+from lio_jax.recipes import recipe_named
+from lio_jax.settings.settings import Settings
 
 _NEAR_M, _SHARE = 10.0, 90
 """Range within which that percentage of the points lies where the surroundings are near: rooms, corridors and
@@ -18,16 +20,6 @@ _LOOKED_AT = 3
 """Scans of which the first with points decides."""
 _OWN_BODY_M = 0.3
 """Nearer returns are of whoever carries the sensor."""
-NEAR_VALUES = {
-    "params.lidar.min_range": 0.5,
-    "params.map.voxel_size": 0.4,
-    "params.map.point_spacing": 0.1,
-    "params.registration.point_spacing": 0.2,
-    "params.registration.inertial_point_spacing": 0.2,
-}
-_TOGETHER = {path for path in NEAR_VALUES if path != "params.lidar.min_range"}
-"""Of the recipe ``default``. With its values for streets, voxels hold more than one wall: on 20 s of walking
-in a simulated office the trajectory's error was 32 mm instead of 7 mm."""
 
 
 def fitted_to_surroundings(sequence: Sequence, settings: Settings) -> tuple[Settings, list[str]]:
@@ -35,18 +27,21 @@ def fitted_to_surroundings(sequence: Sequence, settings: Settings) -> tuple[Sett
 
     Voxels and spacings go together: where one of them was given, none is changed.
     """
-    given = settings.given | (_TOGETHER if settings.given & _TOGETHER else set())
-    free = [path for path in NEAR_VALUES if path not in given]
-    if settings.recipe != "default" or not free:
+    near = recipe_named(settings.recipe).near_values
+    together = {path for path in near if path != "params.lidar.min_range"}
+    given = settings.given | (together if settings.given & together else set())
+    free = [path for path in near if path not in given]
+    if not free:
         return settings, []
+    size = settings.values["map"]["voxel_size"]
     reach = _reach(sequence)
     if reach is None or reach >= _NEAR_M:
         return settings, []
     reason = f"surroundings are near ({_SHARE} % of the points within {reach:.1f} m)"
     for path in free:
-        settings = settings.with_value(path, NEAR_VALUES[path], reason)
-    chosen = ", ".join(f"{path.removeprefix('params.')} {NEAR_VALUES[path]:g}" for path in free)
-    return settings, [f"{reason}: {chosen} m; for a street's values give params.map.voxel_size=1.2."]
+        settings = settings.with_value(path, near[path], reason)
+    chosen = ", ".join(f"{path.removeprefix('params.')} {near[path]:g}" for path in free)
+    return settings, [f"{reason}: {chosen} m; for a street's values give params.map.voxel_size={size:g}."]
 
 
 def _reach(sequence: Sequence) -> float | None:
@@ -75,7 +70,9 @@ def with_sensor_sizes(settings: Settings, scans: Iterable[LidarScan]) -> tuple[S
         settings: of a run.
         scans: of the recording; the first ones decide, by the largest.
     """
-    features = settings.config.features
+    features = getattr(settings.config, "features", None)
+    if not isinstance(features, RingConfig):
+        return settings, []
     open_sizes = [name for name in ("rings", "columns", "surface_points") if getattr(features, name) == 0]
     if not open_sizes:
         return settings, []
@@ -83,20 +80,21 @@ def with_sensor_sizes(settings: Settings, scans: Iterable[LidarScan]) -> tuple[S
         list(islice((scan.ring for scan in scans if len(scan.points)), _SCANS_WITH_RINGS)), features
     )
     chosen = dataclasses.replace(features, **{name: getattr(fitting, name) for name in open_sizes})
-    config = dataclasses.replace(settings.config, features=chosen)
+    section: dict[str, Any] = {"features": chosen}
+    config = dataclasses.replace(settings.config, **section)
     words = ", ".join(f"config.features.{name}={getattr(chosen, name)}" for name in open_sizes)
     return dataclasses.replace(settings, config=config), [f"Sizes by the first scans: {words}."]
 
 
-def _fitting(rings_of_points: list[NDArray[np.int32]], features: FeaturesConfig) -> FeaturesConfig:
+def _fitting(rings_of_points: list[NDArray[np.int32]], features: RingConfig) -> RingConfig:
     known = [ring[ring >= 0] for ring in rings_of_points if (ring >= 0).any()]
     if not known:
-        return FeaturesConfig()
+        return RingConfig()
     most = max(int(ring.max()) for ring in known) + 1
     counts = np.max([np.bincount(ring, minlength=most) for ring in known], axis=0)
     rings = features.rings or _rounded_up(len(counts), 8)
     longest = int(_SLACK * counts[:rings].max())
-    return FeaturesConfig(
+    return RingConfig(
         rings=rings,
         columns=max(_rounded_up(longest, 64), 4 * features.neighbours),
         surface_points=min(_rounded_up(int(_SURFACE_SHARE * counts.sum()), 2048), _MOST_SURFACE_POINTS),

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import atomic_path
-from lio_jax.core.settings import Settings
 from lio_jax.data.gps_checks import cleaned
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory, ns_to_seconds, write_tum
@@ -26,6 +25,7 @@ from lio_jax.run.folder import write_json
 from lio_jax.run.keyframes import KeyframePicker, KeyframeWriter, corner_marks, read_keyframes
 from lio_jax.run.map_file import MapTiles, read_cloud
 from lio_jax.run.track import ScanResult
+from lio_jax.settings.settings import Settings
 
 _KEPT_SPACING = 0.4
 """Of the points that keyframes keep in memory for loops, m; on disk they have all."""
@@ -47,9 +47,9 @@ class GlobalCorrection:
         """
         self.notes: tuple[str, ...] = ()
         """What was found wrong with the fixes."""
-        config = settings.config
-        closer = LoopCloser(settings) if config.backend.loops else None
-        gate = self._gate(sequence, settings) if config.backend.gps else None
+        backend = settings.run.backend
+        closer = LoopCloser(settings) if backend.loops else None
+        gate = self._gate(sequence, settings) if backend.gps else None
         self._settings, self._out = settings, out
         self._origin = sequence.gps().origin if gate else None  # type: ignore[union-attr]
         self._picker, self._store = KeyframePicker(settings), KeyframeWriter(out)
@@ -84,7 +84,7 @@ class GlobalCorrection:
         write_json(self._out / "loops.json", {"loops": [_loop(found, *one) for one in found.loops]})
         if found.T_enu_world is not None:
             write_json(self._out / "georeference.json", _georeference(found.T_enu_world, self._origin))
-        map_points = self._written_map() if self._settings.config.output.map else None
+        map_points = self._written_map() if self._settings.run.output.map else None
         return Trajectory(odometry.stamp_ns, poses), map_points, self._said(found)
 
     def _gate(self, sequence: Sequence, settings: Settings) -> GpsGate:
@@ -95,7 +95,7 @@ class GlobalCorrection:
                 "topic by config.data.gps_topic."
             )
         gps, self.notes = cleaned(recorded, "GPS")
-        elevation = settings.config.backend.gps_elevation
+        elevation = settings.run.backend.gps_elevation
         return GpsGate(gps.stamp_ns, gps.position, gps.covariance, settings.values["gps"], elevation)
 
     def _of_all_stored(

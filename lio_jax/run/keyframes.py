@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import atomic_path
 from lio_jax.core.pose_covariance import carried
-from lio_jax.core.settings import Settings
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.pose_graph.g2o import Edge
 from lio_jax.run.track import ScanResult
+from lio_jax.settings.settings import Settings
 
 _LOOSE = np.diag([1e-2] * 3 + [1.0] * 3)
 """Covariance where nothing is known: sigmas of 0.1 rad and 1 m."""
@@ -27,7 +27,7 @@ class KeyframePicker:
     """Makes keyframes of those scans that moved or turned enough since the last one."""
 
     def __init__(self, settings: Settings) -> None:
-        sigmas, output = settings.values["backend"], settings.config.output
+        sigmas, output = settings.values["backend"], settings.run.output
         self._distance, self._angle = output.keyframe_distance, output.keyframe_angle
         rotation, translation = sigmas["odometry_rotation_sigma"], sigmas["odometry_translation_sigma"]
         self._covariance = np.diag([rotation**2] * 3 + [translation**2] * 3)

@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.core.files import atomic_path
 from lio_jax.core.pose_covariance import carried, covariance_of
-from lio_jax.core.settings import Settings
 from lio_jax.core.types import NavState
 from lio_jax.data.sequence import ImuData
 from lio_jax.data.trajectory import Trajectory, pose_matrices, tum_lines
 from lio_jax.imu.imu_odometry import imu_rate_trajectory
 from lio_jax.run.track import ScanResult, pose_matrix
+from lio_jax.settings.settings import Settings
 
 
 class TrajectoryLog:

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.core.files import atomic_path
-from lio_jax.core.settings import Settings, with_extrinsics
 from lio_jax.data.imu_checks import cleaned
 from lio_jax.data.prefetch import prefetched
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.data.trajectory import Trajectory, write_kitti_poses, write_tum
+from lio_jax.imu.params import OrientedImuConfig
 from lio_jax.pose_graph.g2o import write_g2o
+from lio_jax.recipes.params import InertialConfig
 from lio_jax.run.fitted_settings import fitted_to_surroundings, with_sensor_sizes
 from lio_jax.run.folder import environment, write_json, write_text
 from lio_jax.run.global_correction import GlobalCorrection
@@ -29,6 +30,7 @@ from lio_jax.run.logs import Overflow, ScanLog, TrajectoryLog, write_imu_rate
 from lio_jax.run.map_file import MapFile
 from lio_jax.run.scan_inputs import OFFSET_MARGIN_S, ImuFeed
 from lio_jax.run.track import CompiledStep, ScanResult, track
+from lio_jax.settings.settings import Settings, with_extrinsics
 
 
 class Observer(Protocol):
@@ -114,11 +116,11 @@ def run_sequence(
     failures: list[dict[str, Any]] = []
     overflow = Overflow(settings)
     interruption: BaseException | None = None
-    backend = settings.config.backend
+    backend = settings.run.backend
     correction = GlobalCorrection(sequence, settings, out) if backend.loops or backend.gps else None
-    map_file = MapFile(out / "map.pcd") if settings.config.output.map and not correction else None
+    map_file = MapFile(out / "map.pcd") if settings.run.output.map and not correction else None
     decoded = _timed(sequence.scans(start, count), stage_ms["decode"])
-    scans: Any = prefetched(decoded, settings.config.data.prefetch)
+    scans: Any = prefetched(decoded, settings.run.data.prefetch)
     try:
         try:
             # closing: an observer that raises must not leave the decoding thread and its files behind
@@ -197,7 +199,8 @@ def imu_feed(sequence: Sequence, settings: Settings) -> tuple[ImuFeed | None, tu
 
     None where the recording holds none or ``config.imu.use`` is false: the recipe then does without.
     """
-    if not settings.config.imu.use:
+    config = settings.config
+    if not isinstance(config, InertialConfig) or not config.imu.use:
         return None, ()
     recorded = sequence.imu()
     if recorded is None or not len(recorded.stamp_ns):
@@ -206,8 +209,8 @@ def imu_feed(sequence: Sequence, settings: Settings) -> tuple[ImuFeed | None, tu
     estimated = settings.values["initial"]["time_offset_sigma"] > 0
     margin = OFFSET_MARGIN_S if estimated else 0.0
     offset = settings.values["extrinsics"]["time_offset"]
-    own = settings.config.imu.orientation
-    return ImuFeed(imu, settings.config.imu.buckets, offset, margin, own), found
+    own = isinstance(config.imu, OrientedImuConfig) and config.imu.orientation
+    return ImuFeed(imu, config.imu.buckets, offset, margin, own), found
 
 
 def _described(sequence: Sequence) -> dict[str, Any]:
@@ -257,7 +260,7 @@ def _write_trajectory(out: Path, log: TrajectoryLog, trajectory: Trajectory) -> 
 
 def _write_states(out: Path, log: TrajectoryLog, settings: Settings) -> None:
     log.write_npz(out / "states.npz")
-    output, trajectory = settings.config.output, log.trajectory()
+    output, trajectory = settings.run.output, log.trajectory()
     chosen = keyframe_indices(trajectory.poses, output.keyframe_distance, output.keyframe_angle)
     poses = trajectory.poses[chosen]
     write_g2o(out / "keyframes.g2o", poses, odometry_edges(poses, log.match_covariances()[chosen]))

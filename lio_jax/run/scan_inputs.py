@@ -4,18 +4,18 @@ from typing import Any
 
 import numpy as np
 
-from lio_jax.core.config import LidarConfig
 from lio_jax.core.types import ImuBatch, Scan, state_dtype
 from lio_jax.data.imu_checks import coverage
 from lio_jax.data.sequence import ImuData, LidarScan
+from lio_jax.lidar.params import ScanConfig
 
 
-def bucket_for(count: int, config: LidarConfig) -> int:
+def bucket_for(count: int, config: ScanConfig) -> int:
     """Return the smallest padded size that holds ``count`` points, or the largest there is."""
     return next((size for size in config.buckets if size >= count), config.buckets[-1])
 
 
-def padded(scan: LidarScan, last_end_ns: int | None, config: LidarConfig, size: int | None = None) -> Scan:
+def padded(scan: LidarScan, last_end_ns: int | None, config: ScanConfig, size: int | None = None) -> Scan:
     """Copy a scan into zero-padded arrays of its bucket's size.
 
     A scan larger than the largest bucket is thinned to it by an even stride. Points that are not finite are

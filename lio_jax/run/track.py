@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.config import Config
-from lio_jax.core.params import Params
-from lio_jax.core.settings import Settings
 from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.core.xla import PerShape
 from lio_jax.data.sequence import LidarScan
 from lio_jax.recipes import recipe_named
+from lio_jax.recipes.params import RecipeConfig as Config
+from lio_jax.recipes.params import RecipeParams as Params
 from lio_jax.run.failures import Evidence, failure_of, longest_gap
 from lio_jax.run.scan_inputs import ImuFeed, bucket_for, padded
+from lio_jax.settings.settings import Settings
 
 
 @dataclass(frozen=True)
@@ -137,6 +137,7 @@ class ResultBuilder:
             nis=float(output.nis),
             since_last_s=float(fed.scan.interval),
             restarted=output.restarted is not None and bool(output.restarted),
+            smoother_unfinished=output.smoother_unfinished is not None and bool(output.smoother_unfinished),
             imu_gap_s=_imu_gap(fed.imu, fed.scan, nav) if fed.imu else None,
         )
         failure = failure_of(evidence, self._before, self._settings)

@@ -3,10 +3,10 @@
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass
 
-from lio_jax.core.settings import Settings, recipe_settings
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.run.run import settings_for
+from lio_jax.settings.settings import Settings, recipe_settings
 from lio_jax.tuning.objectives import Objective, objective_named
 from lio_jax.tuning.parameters import free_parameters
 from lio_jax.tuning.recording import Recording

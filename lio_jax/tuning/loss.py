@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.config import Config
+from lio_jax.recipes.params import RecipeConfig as Config
 from lio_jax.tuning.objectives import Objective
 from lio_jax.tuning.parameters import ParameterVector
 from lio_jax.tuning.recording import Recording

@@ -11,10 +11,11 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.params import Params
 from lio_jax.core.types import NavState, Scan, state_dtype
+from lio_jax.lidar.params import BeamParams
 from lio_jax.lidar.range_scatter import range_scatter
 from lio_jax.recipes.output import Evidence
+from lio_jax.recipes.params import RecipeParams as Params
 from lio_jax.registration.point_evidence import PointEvidence
 
 
@@ -202,7 +203,9 @@ def range_noise(seen: Observed, truth: TruePose) -> Float[Array, ""]:
         )
     scatter = range_scatter(scan, params)
     ranges = (params.lidar.range_sigma * scatter.spread) ** 2
-    variance = _CAUCHY**2 * (ranges + (params.lidar.angle_sigma * scatter.slope) ** 2)
+    if isinstance(params.lidar, BeamParams):
+        ranges = ranges + (params.lidar.angle_sigma * scatter.slope) ** 2
+    variance = _CAUCHY**2 * ranges
     loss = jnp.log(variance) / 2 + jnp.log1p(scatter.deviation**2 / variance)
     return _SHARPNESS * jnp.sum(jnp.where(scatter.valid, loss, 0.0))
 

@@ -12,11 +12,8 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.param_values import DEFAULTS, DIFFERENTIABLE
-from lio_jax.core.params import Params
-
-_ROTATION = "extrinsics.rotation"
-_ADDED = ("extrinsics.translation", "extrinsics.time_offset")
+from lio_jax.core.leaf import Tuned, settings_of
+from lio_jax.recipes.params import RecipeParams
 
 
 class ParameterVector(eqx.Module):
@@ -25,7 +22,7 @@ class ParameterVector(eqx.Module):
     A positive leaf is exp(x); translation and time offset are x; a rotation is its start times Exp(x), rad.
     """
 
-    start: Params
+    start: RecipeParams
     """Where ``x`` is :meth:`first`; leaves that are not tuned keep these values."""
     paths: tuple[str, ...] = eqx.field(static=True)
     """Leaves that are tuned, such as ``imu.gyro_noise``."""
@@ -33,18 +30,18 @@ class ParameterVector(eqx.Module):
     @property
     def names(self) -> tuple[str, ...]:
         """Return the P components' names: ``imu.gyro_noise``, ``extrinsics.translation.x``."""
-        return tuple(name for path in self.paths for name in _component_names(path))
+        return tuple(name for path in self.paths for name in _component_names(self.start, path))
 
     def first(self) -> Float[Array, " p"]:
         """Return the vector of the start."""
-        return jnp.concatenate([_encoded(path, _leaf(self.start, path)) for path in self.paths])
+        return jnp.concatenate([_encoded(self.start, path) for path in self.paths])
 
-    def __call__(self, x: Float[Array, " p"]) -> Params:
+    def __call__(self, x: Float[Array, " p"]) -> RecipeParams:
         """Return the parameters of a vector."""
         params, used = self.start, 0
         for path in self.paths:
-            size = len(_component_names(path))
-            value = _decoded(path, x[used : used + size], _leaf(self.start, path))
+            size = len(_component_names(self.start, path))
+            value = _decoded(self.start, path, x[used : used + size])
             params = eqx.tree_at(partial(_leaf, path=path), params, value)
             used += size
         return params
@@ -55,7 +52,7 @@ class ParameterVector(eqx.Module):
         return {f"params.{path}": np.asarray(_leaf(params, path)).tolist() for path in self.paths}
 
 
-def free_parameters(start: Params, patterns: tuple[str, ...] | list[str]) -> ParameterVector:
+def free_parameters(start: RecipeParams, patterns: tuple[str, ...] | list[str]) -> ParameterVector:
     """Return the parameters that the patterns name.
 
     Args:
@@ -67,18 +64,19 @@ def free_parameters(start: Params, patterns: tuple[str, ...] | list[str]) -> Par
         UsageError: a pattern names no leaf, or only leaves without a derivative, or a leaf to be tuned on a
             log scale starts at zero.
     """
-    leaves = [f"{section}.{name}" for section, names in DEFAULTS.items() for name in names]
+    leaves = settings_of(type(start))
+    smooth_ones = [path for path, leaf in leaves.items() if leaf.declared.tuned]
     chosen: list[str] = []
     for pattern in patterns:
         bare = pattern.removeprefix("params.")
         named = [leaf for leaf in leaves if fnmatchcase(leaf, bare)]
         if not named:
-            raise UsageError(f"no parameter is called '{pattern}'; {_choice()}")
-        smooth = [leaf for leaf in named if leaf in DIFFERENTIABLE]
+            raise UsageError(f"no parameter is called '{pattern}'; {_choice(smooth_ones)}")
+        smooth = [leaf for leaf in named if leaf in smooth_ones]
         if not smooth:
             raise UsageError(
                 f"'{pattern}' has no derivative, because it only chooses (points, voxels, when to stop); "
-                f"{_choice()}"
+                f"{_choice(smooth_ones)}"
             )
         starting = [leaf for leaf in smooth if _may_start(start, leaf)]
         if not starting:
@@ -88,37 +86,43 @@ def free_parameters(start: Params, patterns: tuple[str, ...] | list[str]) -> Par
             )
         chosen += [leaf for leaf in starting if leaf not in chosen]
     if not chosen:
-        raise UsageError(f"no parameter to tune was named; {_choice()}")
+        raise UsageError(f"no parameter to tune was named; {_choice(smooth_ones)}")
     return ParameterVector(start, tuple(chosen))
 
 
-def _choice() -> str:
-    return "those that can be tuned: " + ", ".join(DIFFERENTIABLE) + "."
+def _choice(paths: list[str]) -> str:
+    return "those that can be tuned: " + ", ".join(paths) + "."
 
 
-def _may_start(start: Params, path: str) -> bool:
-    return path == _ROTATION or path in _ADDED or bool(_leaf(start, path) > 0)
+def _may_start(start: RecipeParams, path: str) -> bool:
+    return _tuned(start, path) != "log" or bool(_leaf(start, path) > 0)
 
 
-def _leaf(params: Params, path: str) -> Array:
+def _tuned(start: RecipeParams, path: str) -> Tuned | None:
+    return settings_of(type(start))[path].declared.tuned
+
+
+def _leaf(params: RecipeParams, path: str) -> Array:
     section, name = path.split(".")
     return getattr(getattr(params, section), name)
 
 
-def _component_names(path: str) -> tuple[str, ...]:
-    if path in (_ROTATION, "extrinsics.translation"):
+def _component_names(start: RecipeParams, path: str) -> tuple[str, ...]:
+    if _leaf(start, path).ndim:
         return tuple(f"{path}.{axis}" for axis in "xyz")
     return (path,)
 
 
-def _encoded(path: str, value: Array) -> Float[Array, " k"]:
-    if path == _ROTATION:
+def _encoded(start: RecipeParams, path: str) -> Float[Array, " k"]:
+    value, tuned = _leaf(start, path), _tuned(start, path)
+    if tuned == "turn":
         return jnp.zeros(3, value.dtype)
-    return jnp.atleast_1d(value if path in _ADDED else jnp.log(value))
+    return jnp.atleast_1d(jnp.log(value) if tuned == "log" else value)
 
 
-def _decoded(path: str, x: Float[Array, " k"], start: Array) -> Array:
-    if path == _ROTATION:
-        turned = jaxlie.SO3.from_quaternion_xyzw(start) @ jaxlie.SO3.exp(x)
+def _decoded(start: RecipeParams, path: str, x: Float[Array, " k"]) -> Array:
+    value, tuned = _leaf(start, path), _tuned(start, path)
+    if tuned == "turn":
+        turned = jaxlie.SO3.from_quaternion_xyzw(value) @ jaxlie.SO3.exp(x)
         return turned.normalize().as_quaternion_xyzw()
-    return x.reshape(start.shape) if path in _ADDED else jnp.exp(x.reshape(start.shape))
+    return jnp.exp(x.reshape(value.shape)) if tuned == "log" else x.reshape(value.shape)

@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
-from lio_jax.core.config import Config
 from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.core.xla import PerShape
 from lio_jax.recipes import recipe_named
+from lio_jax.recipes.params import RecipeConfig as Config
 from lio_jax.run.track import run_steps
 from lio_jax.tuning.objectives import Objective, Observed, TruePose
 from lio_jax.tuning.parameters import ParameterVector

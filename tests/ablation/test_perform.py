@@ -64,7 +64,7 @@ def test_a_batch_equals_the_runs_one_by_one(tmp_path, monkeypatch):
     tasks = tasks_of(
         load_spec(write_spec(tmp_path / "spec.yaml", set={**SMALL, **DENSE}, sequences=[STANDING]))
     )
-    sequence = tasks[0].source.open(tasks[0].settings.config.data)
+    sequence = tasks[0].source.open(tasks[0].settings.run.data)
     settings = [settings_for(sequence, one.settings)[0] for one in tasks]
     batched = run_batch(sequence, settings, BatchPrograms("default", settings[0].config))
     programs = Programs("default", settings[0].config)

@@ -11,7 +11,7 @@ from lio_jax.ablation.sources import Recorded
 from lio_jax.ablation.store import opened
 from lio_jax.ablation.tasks import Task
 from lio_jax.ablation.variants import Variant
-from lio_jax.core.settings import Settings
+from lio_jax.settings.settings import Settings
 
 RECORDINGS, VARIANTS = 4, 12
 TAKES_S = 0.06

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from lio_jax.core.settings import Settings, load_settings
+from lio_jax.settings.settings import Settings, load_settings
 from tests.commands.conftest import Cli
 
 RATE = 50

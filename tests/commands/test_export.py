@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lio_jax.core.config import DataConfig
+from lio_jax.data.config import DataConfig
 from lio_jax.data.detect import open_sequence
 from lio_jax.data.trajectory import read_tum
 

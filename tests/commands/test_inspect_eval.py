@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from lio_jax.core.settings import load_settings
 from lio_jax.data.trajectory import Trajectory, write_tum
+from lio_jax.settings.settings import load_settings
 from tests.data import bags
 from tests.run.small_drive import COUNT, bag_messages, moving, without_points, write_folder
 

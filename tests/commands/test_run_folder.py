@@ -8,7 +8,7 @@ import yaml
 from pypcd4 import PointCloud
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.settings import load_settings
+from lio_jax.settings.settings import load_settings
 from tests.commands.conftest import PLAIN
 from tests.run.small_drive import COUNT, drive, moving
 

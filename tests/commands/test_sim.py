@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.commands import sim as command
 from lio_jax.commands.sim_options import ErrorOptions, MotionOptions, SensorOptions
-from lio_jax.core.config import DataConfig
+from lio_jax.data.config import DataConfig
 from lio_jax.data.detect import open_sequence
 from lio_jax.data.native import NativeSequence
 from lio_jax.data.trajectory import read_tum, write_kitti_poses

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.data.bag_writer import write_bag
+from lio_jax.data.config import DataConfig
 from lio_jax.data.native_writer import write_native
 from lio_jax.data.rosbag import RosbagSequence
 from lio_jax.data.sequence import LidarScan

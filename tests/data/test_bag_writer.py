@@ -10,9 +10,9 @@ import pytest
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.config import DataConfig
 from lio_jax.data import bag_writer
 from lio_jax.data.bag_writer import write_bag
+from lio_jax.data.config import DataConfig
 from lio_jax.data.enu import geodetic_to_enu
 from lio_jax.data.native import NativeSequence
 from lio_jax.data.native_writer import write_native

@@ -9,8 +9,8 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.config import DataConfig
 from lio_jax.core.errors import LioJaxError
+from lio_jax.data.config import DataConfig
 from lio_jax.data.native import NativeSequence
 from lio_jax.data.native_writer import write_native
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lio_jax.core.config import DataConfig
+from lio_jax.data.config import DataConfig
 from lio_jax.data.point_time import PointTiming, TimeSample, recognise_point_time, scan_period
 
 STAMP = 1_700_000_000_123_456_789

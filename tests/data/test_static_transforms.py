@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.config import DataConfig
+from lio_jax.data.config import DataConfig
 from lio_jax.data.rosbag import RosbagSequence
 from lio_jax.data.static_transforms import transform_between
 from tests.data import bags

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lio_jax.core.config import DataConfig
+from lio_jax.data.config import DataConfig
 from lio_jax.data.detect import open_sequence
 from lio_jax.data.native_writer import write_native
 from tests.data import bags

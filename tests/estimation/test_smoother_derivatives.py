@@ -7,10 +7,10 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.core.params import ImuParams
 from lio_jax.estimation.iterated_filter import CONVERGED
 from lio_jax.estimation.marginal_likelihood import log_evidence
 from lio_jax.estimation.smoother import smooth
+from lio_jax.imu.params import ImuParams
 from tests.experiments import bench_path  # noqa: F401
 from tests.imu.motion import quick_jit
 

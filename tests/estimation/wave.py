@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import jaxlie
 
 from lio_jax.core.error_state import DOF, NavEstimate, SweptState, local, retract
-from lio_jax.core.params import ImuParams
 from lio_jax.core.types import ImuBatch, NavState
 from lio_jax.estimation.iterated_filter import Update
 from lio_jax.estimation.nav_update import update_nav
 from lio_jax.estimation.pose_measurement import measured_pose
+from lio_jax.imu.params import ImuParams
 from lio_jax.imu.strapdown import propagate
 
 STEP = 1 / 200

@@ -20,9 +20,10 @@ from lio_jax.core.error_state import (
     TIME_OFFSET,
     VELOCITY,
 )
-from lio_jax.core.params import InitialParams, default_params
 from lio_jax.core.types import ImuBatch
 from lio_jax.imu.initialise import RestStart, initialise_at_rest
+from lio_jax.imu.params import InitialParams
+from tests.params import default_params
 
 GRAVITY_STRENGTH = 9.80665
 RATE = 200

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from lio_jax.core.error_state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
-from lio_jax.core.params import default_params
 from lio_jax.core.types import ImuBatch
 from lio_jax.imu.initialise_moving import MovingStart, initialise_moving
 from tests.imu.motions import Pose, handheld, straight, truth_at, turning_car
+from tests.params import default_params
 
 PARAMS = default_params()
 RATE, SPANS, PERIOD = 200, 10, 0.1

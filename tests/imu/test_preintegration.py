@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.params import ImuParams, default_params
 from lio_jax.core.types import NavState
+from lio_jax.imu.params import ImuParams
 from lio_jax.imu.preintegration import (
     Preintegrated,
     compose,
@@ -19,6 +19,7 @@ from lio_jax.imu.preintegration import (
 )
 from lio_jax.imu.sampling import Intervals
 from tests.imu.motion import nav_at, quick_jit
+from tests.params import default_params
 
 gtsam = pytest.importorskip("gtsam")
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from lio_jax.core.error_state import ACCEL_BIAS, DOF, GYRO_BIAS, NavEstimate, local, retract
-from lio_jax.core.params import default_params
 from lio_jax.core.types import ImuBatch
 from lio_jax.imu.strapdown import path_along, propagate
 from tests.imu.motion import ideal_imu, nav_at, pose_matrix, quick_jit, velocity
+from tests.params import default_params
 
 PARAMS = default_params().imu
 NOISELESS = jax.tree.map(jnp.zeros_like, PARAMS)

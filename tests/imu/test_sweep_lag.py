@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from lio_jax.core.error_state import DOF, LAG, POSITION, ROTATION, NavEstimate, retract
-from lio_jax.core.params import default_params
 from lio_jax.imu.path import pose_at
 from lio_jax.imu.strapdown import path_along, propagate_sweep
 from lio_jax.imu.sweep_mean_error import still_to_show
 from tests.imu.motion import ideal_imu, nav_at, quick_jit
+from tests.params import default_params
 
 PARAMS = default_params().imu
 NOISELESS = jax.tree.map(jnp.zeros_like, PARAMS)

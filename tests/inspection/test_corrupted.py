@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.settings import load_settings
 from lio_jax.inspection import settings_text
+from lio_jax.settings.settings import load_settings
 from tests.inspection.walk import Change, inspected, turned, walk, with_imu, with_scans
 
 

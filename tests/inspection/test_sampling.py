@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lio_jax.core.config import DataConfig
+from lio_jax.data.config import DataConfig
 from lio_jax.data.rosbag import RosbagSequence
 from lio_jax.inspection import inspect_sequence, sampling
 from lio_jax.inspection.sampling import WINDOW_SCANS, sampled

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lio_jax.core.config import Config, DataConfig, FeaturesConfig, LidarConfig
-from lio_jax.core.param_values import DEFAULTS
-from lio_jax.core.params import Params, params_from_values
 from lio_jax.core.types import Scan
+from lio_jax.data.config import DataConfig
 from lio_jax.data.detect import open_sequence
 from lio_jax.data.sequence import LidarScan
+from lio_jax.lidar.params import LoamRingConfig, ScanConfig
 from lio_jax.run.scan_inputs import padded
+from tests.params import DEFAULTS, Config, Params, params_from_values
 from tests.shared_data import SHARED_DATA
 
 RECORDINGS = {
@@ -27,7 +27,7 @@ RECORDINGS = {
 
 
 def config_of(**features) -> Config:
-    return Config(features=FeaturesConfig(**features))
+    return Config(features=LoamRingConfig(**features))
 
 
 def params_of(**leaves: float) -> Params:
@@ -60,7 +60,7 @@ def scan_of(points: np.ndarray, ring: np.ndarray, time: np.ndarray | None = None
         intensity=np.zeros(count, np.float32),
         duration=0.1,
     )
-    return on_device(padded(recorded, None, LidarConfig(), size or None))
+    return on_device(padded(recorded, None, ScanConfig(), size or None))
 
 
 def on_device(scan: Scan) -> Scan:

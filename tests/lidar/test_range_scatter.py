@@ -10,13 +10,13 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from lio_jax.core.config import LidarConfig
-from lio_jax.core.params import default_params
 from lio_jax.core.types import Scan, initial_nav_state
+from lio_jax.lidar.params import ScanConfig
 from lio_jax.lidar.range_scatter import range_scatter
 from lio_jax.run.scan_inputs import padded
 from lio_jax.tuning.objectives import _CAUCHY, _SHARPNESS, Observed, TruePose, range_noise
 from tests.lidar.ring_scans import on_device, real_scans
+from tests.params import default_params
 from tests.shared_data import needs_shared
 
 PARAMS = default_params()
@@ -130,6 +130,6 @@ def test_the_range_noise_is_found_among_poles(sigma, start):
 @pytest.mark.parametrize("name", ["kitti_odometry_04", "kitti_raw_0005", "kitti_raw_0060", "ouster_os1_128"])
 def test_recorded_returns_scatter_by_about_a_centimetre(name):
     scan, _ = next(real_scans(name))
-    deviation, spread, _ = values(on_device(padded(scan, None, LidarConfig())))
+    deviation, spread, _ = values(on_device(padded(scan, None, ScanConfig())))
     assert len(deviation) > 1000
     assert 0.005 < 1.4826 * np.median(np.abs(deviation / spread)) < 0.02

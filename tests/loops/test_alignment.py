@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from lio_jax.core.params import default_params
 from lio_jax.loops.alignment import aligned
 from lio_jax.loops.keyframe import padded, thinned
 from tests.loops.places import pose, seen_from
+from tests.params import default_params
 
 TRUTH = pose(2.0, -1.0, 0.2, 0.4)
 

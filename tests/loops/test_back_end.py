@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.settings import Settings
 from lio_jax.loops.back_end import BackEnd, corrected_poses, levelled_onto
 from lio_jax.loops.gps import GpsGate
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.loops.proposals import Proposal
 from lio_jax.loops.verification import Verdict
+from lio_jax.settings.settings import Settings
 from tests.loops.drives import LEVER, SHIFT, SPEED, YAW, poses_at, to_enu
 
 LAP, COUNT = 126, 252

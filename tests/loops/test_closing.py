@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from loops import closed, error_of, revisits, town
 
-from lio_jax.core.settings import Settings
 from lio_jax.loops.closing import LoopCloser, held_by
 from lio_jax.loops.proposals import Proposal
 from lio_jax.loops.verification import Verdict
+from lio_jax.settings.settings import Settings
 from tests.loops.places import keyframe, pose
 
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from lio_jax.core.param_values import DEFAULTS
 from lio_jax.loops.consistency import Consensus, consistent
 from lio_jax.loops.proposals import Proposal
 from lio_jax.loops.verification import Verdict
 from tests.loops.places import keyframe, pose
+from tests.params import DEFAULTS
 
 LIMITS = DEFAULTS["loop"]
 RADIUS, COUNT = 40.0, 400

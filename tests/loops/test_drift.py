@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from lio_jax.core.param_values import DEFAULTS
 from lio_jax.loops.proposals import metres_from, possible_error
+from tests.params import DEFAULTS
 
 LIMITS = DEFAULTS["loop"]
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from lio_jax.core.settings import Settings, recipe_settings
 from lio_jax.loops.gps import Fix, GpsGate, Refusal
+from lio_jax.settings.settings import Settings, recipe_settings
 from tests.loops.drives import LEVER, drive, to_enu
 
 STEPS = np.linalg.norm(np.diff(drive(30).antennas(), axis=0), axis=1)
@@ -189,4 +189,4 @@ def test_lio_sams_values():
     expected = {"min_travel": 5.0, "pose_variance": 25.0, "time_gap": 0.2, "max_variance": 2.0}
     expected |= {"spacing": 5.0, "min_variance": 1.0, "height_variance": 0.01}
     assert {name: gps[name] for name in expected} == expected
-    assert not recipe_settings("lio_sam").config.backend.gps_elevation
+    assert not recipe_settings("lio_sam").run.backend.gps_elevation

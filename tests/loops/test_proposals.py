@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from lio_jax.core.param_values import DEFAULTS
 from lio_jax.loops.place_descriptor import Places
 from lio_jax.loops.proposals import described_proposals, external_proposal, is_old, nearest_proposal
 from tests.loops.places import keyframe, pillars, pose, seen_from
+from tests.params import DEFAULTS
 
 LIMITS = DEFAULTS["loop"]
 

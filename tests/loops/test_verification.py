@@ -8,9 +8,9 @@ import pytest
 from loops import error_of
 from simulated_keyframes import driven, keyframes_of, times_along
 
-from lio_jax.core.settings import Settings
 from lio_jax.loops.proposals import external_proposal
 from lio_jax.loops.verification import verify
+from lio_jax.settings.settings import Settings
 from lio_jax.sim.assembly import assembled
 from lio_jax.sim.blocks import LANE, lap
 from lio_jax.sim.lidar import spinning_lidar

@@ -8,8 +8,8 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.core.params import default_params
 from lio_jax.mapping.keyframes import KeyframeCloud, is_due, next_to_enter, no_keyframes, with_keyframe
+from tests.params import default_params
 
 CORNERS, SURFACES = 8, 16
 PARAMS = default_params().submap

@@ -9,15 +9,15 @@ import jaxlie
 import numpy as np
 from scipy.linalg import expm
 
-from lio_jax.core.config import Config, LidarConfig, MapConfig
-from lio_jax.core.param_values import DEFAULTS
-from lio_jax.core.params import Params, params_from_values
 from lio_jax.core.types import Scan
+from lio_jax.lidar.params import LidarConfig
+from lio_jax.mapping.params import MapConfig
 from lio_jax.recipes.default import Default, State
 from lio_jax.recipes.output import Output
 from lio_jax.sim.assembly import assembled
 from lio_jax.sim.lidar import column_times, spinning_lidar, sweep
 from lio_jax.sim.worlds import Counts, World, nearest_part
+from tests.params import DEFAULTS, Config, Params, params_from_values
 
 PERIOD, BEAMS, COLUMNS = 0.1, 16, 256
 CONFIG = Config(

@@ -10,7 +10,6 @@ import pytest
 from scipy.linalg import expm
 
 from lio_jax.core.error_state import POSITION, ROTATION, VELOCITY, NavEstimate
-from lio_jax.core.params import default_params
 from lio_jax.core.types import Scan
 from lio_jax.imu.discretise import UNKNOWN_ACCEL, UNKNOWN_RATE
 from lio_jax.recipes.constant_velocity import (
@@ -20,6 +19,7 @@ from lio_jax.recipes.constant_velocity import (
     unlevelled_start,
     until_its_middle,
 )
+from tests.params import default_params
 
 PARAMS = default_params()
 SPEED = np.array([4.0, -0.5, 0.2])

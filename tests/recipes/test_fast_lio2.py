@@ -12,15 +12,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.error_state import EXTRINSIC_ROTATION, GYRO_BIAS, POSITION
-from lio_jax.core.param_values import DEFAULTS
-from lio_jax.core.params import Params
-from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.recipes import recipe_named
 from lio_jax.recipes.fast_lio2 import FastLio2
 from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES
 from lio_jax.run.scan_inputs import ImuFeed, padded
+from lio_jax.settings.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
+from tests.params import DEFAULTS, Params
 
 SMALL = [
     "config.lidar.buckets=[8192]",

@@ -10,12 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.error_state import EXTRINSIC_ROTATION, EXTRINSIC_TRANSLATION, TIME_OFFSET
-from lio_jax.core.settings import Settings, with_extrinsics, with_overrides
 from lio_jax.evaluation.consistency import nees
 from lio_jax.run.fitted_settings import NEAR_VALUES
 from lio_jax.run.run import settings_for
 from lio_jax.run.scan_inputs import OFFSET_MARGIN_S, ImuFeed
 from lio_jax.run.track import CompiledStep, ScanResult, pose_matrix, track
+from lio_jax.settings.settings import Settings, with_extrinsics, with_overrides
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
 

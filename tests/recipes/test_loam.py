@@ -11,18 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.config import Config
 from lio_jax.core.errors import UsageError
-from lio_jax.core.param_values import DEFAULTS
-from lio_jax.core.params import Params
-from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.core.xla import PerShape
 from lio_jax.recipes import loam, recipe_named
 from lio_jax.recipes.loam import Loam
 from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES
 from lio_jax.run.run import settings_for
 from lio_jax.run.scan_inputs import padded
+from lio_jax.settings.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.sim.sequence import SimulatedSequence
+from tests.params import DEFAULTS, Config, Params
 from tests.recipes.test_fast_lio2 import ate, recording, truth
 
 SMALL = [

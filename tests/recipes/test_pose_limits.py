@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.params import SmootherParams, default_params
 from lio_jax.core.types import ImuBatch
+from lio_jax.estimation.params import SmootherParams
 from lio_jax.recipes.pose_limits import drawn_to_tilt, measured_attitude, within_limits
+from tests.params import default_params
 
 RNG = np.random.default_rng(5)
 

@@ -8,10 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.param_values import DEFAULTS
-from lio_jax.core.params import default_params
 from lio_jax.core.types import state_dtype
 from lio_jax.recipes.default import Default
+from tests.params import DEFAULTS, default_params
 from tests.recipes.drive import (
     CONFIG,
     PARAMS,

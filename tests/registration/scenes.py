@@ -8,9 +8,8 @@ import jaxlie
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.param_values import DEFAULTS
-from lio_jax.core.params import Params, params_from_values
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
+from tests.params import DEFAULTS, Params, params_from_values
 
 Surface = Callable[[np.random.Generator, int], np.ndarray]
 """Draws n points (n, 3) of a surface, m in world."""

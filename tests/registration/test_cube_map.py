@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.settings import recipe_settings, with_overrides
 from lio_jax.mapping.point_map import EDGE
 from lio_jax.registration.cube_map import added_to, matched_cubes
 from lio_jax.registration.feature_map import empty_feature_map, frames_at
 from lio_jax.registration.lines_and_planes import FeaturePoints
+from lio_jax.settings.settings import recipe_settings, with_overrides
 from tests.mapping.test_point_map import held
 
 PARAMS = recipe_settings("loam").params()

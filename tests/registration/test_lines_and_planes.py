@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from lio_jax.core.settings import recipe_settings, with_overrides
 from lio_jax.mapping.point_map import EDGE, empty_map, insert
 from lio_jax.mapping.voxel_map import anchor_of
 from lio_jax.registration.knn_planes import planes_near
@@ -22,6 +21,7 @@ from lio_jax.registration.lines_and_planes import (
     no_lines_and_planes,
 )
 from lio_jax.registration.voxel_plane_icp import Frame
+from lio_jax.settings.settings import recipe_settings, with_overrides
 from tests.mapping.test_point_map import held
 from tests.registration.test_knn_planes import columns
 
@@ -283,7 +283,7 @@ def test_five_neighbours_of_real_scans_are_those_of_a_k_d_tree():
     """Planes of the loam recipe's map, from real scans: recall within its search radius."""
     from pathlib import Path
 
-    from lio_jax.core.config import DataConfig
+    from lio_jax.data.config import DataConfig
     from lio_jax.data.detect import open_sequence
     from lio_jax.mapping.nearest_points import nearest_points
 

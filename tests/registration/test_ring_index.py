@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from lio_jax.core.config import Config, DataConfig, FeaturesConfig
-from lio_jax.core.settings import recipe_settings
+from lio_jax.data.config import DataConfig
 from lio_jax.data.detect import open_sequence
 from lio_jax.lidar.features import loam_features
+from lio_jax.lidar.params import LoamRingConfig
 from lio_jax.registration.ring_index import Queries, nearest_by_ring, ring_index
 from lio_jax.run.scan_inputs import padded
+from lio_jax.settings.settings import recipe_settings
 from lio_jax.sim.sequence import SimulatedSequence
+from tests.params import Config
 
 _index = jax.jit(ring_index, static_argnums=3)
 _nearest = jax.jit(nearest_by_ring, static_argnums=3)
@@ -157,7 +159,7 @@ def scans_of(name: str):
 @pytest.mark.parametrize("name", ["kitti", "city"])
 def test_recall_on_consecutive_scans(name):
     scans, rings, columns = scans_of(name)
-    config = Config(features=FeaturesConfig(rings=rings, columns=columns))
+    config = Config(features=LoamRingConfig(rings=rings, columns=columns))
     features = jax.jit(partial(loam_features, config))
     params = recipe_settings("loam").params()
     last, now = (

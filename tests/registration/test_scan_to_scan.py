@@ -8,18 +8,19 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.core.config import Config, FeaturesConfig
-from lio_jax.core.settings import recipe_settings, with_overrides
 from lio_jax.lidar.features import loam_features
+from lio_jax.lidar.params import LoamRingConfig
 from lio_jax.registration.feature_icp import register_features
 from lio_jax.registration.gauss_newton import CONVERGED, TOO_FEW_MATCHES
 from lio_jax.registration.lines_and_planes import FeaturePoints
 from lio_jax.registration.scan_to_scan import ScanToScan, empty_scan, last_scan
+from lio_jax.settings.settings import recipe_settings, with_overrides
+from tests.params import Config
 from tests.recipes.drive import BEAMS, COLUMNS, lidar_pose, scan
 
 SETTINGS = with_overrides(recipe_settings("loam"), ["params.lidar.min_range=0.5"])
 PARAMS = SETTINGS.params()
-CONFIG = Config(features=FeaturesConfig(rings=BEAMS, columns=COLUMNS + 64, surface_points=4096))
+CONFIG = Config(features=LoamRingConfig(rings=BEAMS, columns=COLUMNS + 64, surface_points=4096))
 SLOW = np.array([1.5, 0.3, 0.1, 0.02, -0.03, 0.3])
 """Twist: m/s, then rad/s."""
 _features = jax.jit(partial(loam_features, CONFIG))

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from lio_jax.core.settings import recipe_settings
 from lio_jax.mapping.keyframes import no_keyframes
 from lio_jax.mapping.nearest_points import nearest_points
 from lio_jax.registration.feature_map import empty_feature_map, frames_at
 from lio_jax.registration.lines_and_planes import FeaturePoints
 from lio_jax.registration.submap import Submap, with_scan
+from lio_jax.settings.settings import recipe_settings
 
 PARAMS = recipe_settings("lio_sam").params()
 CORNERS, SURFACES = 64, 256

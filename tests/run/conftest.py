@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from lio_jax.commands.runtime import prepare_jax
-from lio_jax.core.settings import Settings, with_extrinsics, with_overrides
 from lio_jax.run.track import CompiledStep, ScanResult, track
+from lio_jax.settings.settings import Settings, with_extrinsics, with_overrides
 from tests.run import inertial_drive, small_drive
 from tests.run.program_cache import kept_programs
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.settings import Settings, with_overrides
 from lio_jax.core.types import ImuBatch
 from lio_jax.estimation.iterated_filter import NOT_FINITE
 from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES
 from lio_jax.run.failures import Evidence, failure_of, longest_gap, unobserved_directions
+from lio_jax.settings.settings import Settings, with_overrides
 
 SETTINGS = Settings()
 UNTURNED = Rotation.identity()

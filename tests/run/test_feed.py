@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lio_jax.core.config import LidarConfig
+from lio_jax.lidar.params import ScanConfig
 from lio_jax.run.scan_inputs import bucket_for, padded
 from tests.run.small_drive import PERIOD_NS, moving, without_points
 
-CONFIG = LidarConfig(buckets=(100, 8192))
+CONFIG = ScanConfig(buckets=(100, 8192))
 
 
 @pytest.mark.parametrize(("count", "size"), [(0, 100), (100, 100), (101, 8192), (8192, 8192), (9000, 8192)])
@@ -44,7 +44,7 @@ def test_too_large_a_scan_is_thinned_over_its_whole_length():
     scan = moving()[0]
     count = len(scan.points)
     many = replace(scan, intensity=np.arange(count, dtype=np.float32))
-    arrays = padded(many, None, LidarConfig(buckets=(1000,)))
+    arrays = padded(many, None, ScanConfig(buckets=(1000,)))
     assert arrays.mask.all()
     assert arrays.intensity[0] == 0
     assert arrays.intensity[-1] == count - 1

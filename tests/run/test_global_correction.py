@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.core.settings import Settings, with_overrides
 from lio_jax.data.trajectory import read_tum
 from lio_jax.loops.back_end import BackEnd
 from lio_jax.run.keyframes import read_keyframes
 from lio_jax.run.map_file import read_cloud
 from lio_jax.run.run import run_sequence, settings_for
+from lio_jax.settings.settings import Settings, with_overrides
 from lio_jax.sim.gps import GpsModel
 from lio_jax.sim.sequence import SimulatedSequence
 from tests.run.small_drive import Replay, moving

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lio_jax.core.settings import Settings
 from lio_jax.data.trajectory import Trajectory, read_tum
 from lio_jax.run import logs as imu_rate
 from lio_jax.run.logs import TrajectoryLog, write_imu_rate
 from lio_jax.run.run import run_sequence
+from lio_jax.settings.settings import Settings
 from tests.run.inertial_drive import InertialReplay, drive, errors, imu, scans
 
 

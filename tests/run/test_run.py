@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from lio_jax.core.errors import LioJaxError, UsageError
-from lio_jax.core.settings import with_overrides
 from lio_jax.data.trajectory import read_tum
 from lio_jax.run.run import run_sequence, settings_for
+from lio_jax.settings.settings import with_overrides
 from tests.run.small_drive import COUNT, Replay, moving, without_points
 
 FILES = [

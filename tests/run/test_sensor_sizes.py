@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from lio_jax.core.config import FeaturesConfig
-from lio_jax.core.settings import recipe_settings, with_overrides
 from lio_jax.data.sequence import LidarScan
+from lio_jax.lidar.params import LoamRingConfig
 from lio_jax.run.fitted_settings import with_sensor_sizes
+from lio_jax.settings.settings import recipe_settings, with_overrides
 
 LOAM = recipe_settings("loam")
 
@@ -46,7 +46,7 @@ def test_what_is_given_stays():
 @pytest.mark.parametrize("scans", [[], [scan(0, 0)]])
 def test_a_recording_without_points_gets_the_usual_sizes(scans):
     features = with_sensor_sizes(LOAM, scans)[0].config.features
-    assert (features.rings, features.columns) == (FeaturesConfig().rings, FeaturesConfig().columns)
+    assert (features.rings, features.columns) == (LoamRingConfig().rings, LoamRingConfig().columns)
 
 
 def test_rings_of_a_few_points_leave_room_for_a_neighbourhood():

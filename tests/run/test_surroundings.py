@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lio_jax.core.settings import recipe_settings, with_overrides
 from lio_jax.run.fitted_settings import NEAR_VALUES, fitted_to_surroundings
+from lio_jax.settings.settings import recipe_settings, with_overrides
 from tests.run.small_drive import Replay, moving
 
 

@@ -6,13 +6,13 @@ from functools import cache
 import jax.numpy as jnp
 import numpy as np
 
-from lio_jax.core.param_values import DEFAULTS
-from lio_jax.core.settings import Settings, recipe_settings, with_overrides
 from lio_jax.run.run import settings_for
 from lio_jax.run.track import ScanInput
+from lio_jax.settings.settings import Settings, recipe_settings, with_overrides
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
 from lio_jax.tuning.recording import Recording
+from tests.params import DEFAULTS
 
 SCANS = 20
 SMALL = [

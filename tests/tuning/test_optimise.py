@@ -7,11 +7,11 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.core.params import default_params
 from lio_jax.tuning.loss import Evaluated
 from lio_jax.tuning.optimise import Bounds, adam, fisher_information, fisher_scoring, lbfgsb
 from lio_jax.tuning.parameters import free_parameters
 from lio_jax.tuning.session import HISTORY, Session
+from tests.params import default_params
 
 WIDE = Bounds(np.full(2, -20.0), np.full(2, 20.0))
 SAMPLES = np.random.default_rng(0).normal(0.0, [0.02, 3.0], (4000, 2))

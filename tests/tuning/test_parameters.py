@@ -6,8 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.params import default_params
 from lio_jax.tuning.parameters import free_parameters
+from tests.params import default_params
 
 
 def test_positive_parameters_are_logarithms_and_the_rest_stays():

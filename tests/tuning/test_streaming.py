@@ -6,15 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.param_values import DIFFERENTIABLE
-from lio_jax.core.settings import recipe_settings
 from lio_jax.recipes import RECIPES
 from lio_jax.run.track import CompiledStep, run_steps
+from lio_jax.settings.settings import recipe_settings
 from lio_jax.tuning.objectives import MarginalLikelihood, Observed
 from lio_jax.tuning.parameters import free_parameters
 from lio_jax.tuning.reverse import CheckpointedGradient
 from lio_jax.tuning.streaming import StreamingGradient
 from lio_jax.tuning.values import StreamingValues
+from tests.params import DIFFERENTIABLE
 from tests.tuning.recordings import SCANS, TIGHT, DoubleRecording, drive, settings
 
 STEPS = {

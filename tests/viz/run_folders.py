@@ -8,8 +8,8 @@ import numpy as np
 from pypcd4 import PointCloud
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.settings import recipe_settings
 from lio_jax.data.trajectory import Trajectory, write_tum
+from lio_jax.settings.settings import recipe_settings
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -3,8 +3,8 @@
 import pytest
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.settings import Settings, load_settings, settings_from_yaml, with_overrides
-from tests.core.test_settings import PATHS, SOURCE, as_file
+from lio_jax.settings.settings import Settings, load_settings, settings_from_yaml, with_overrides
+from tests.settings.test_settings import PATHS, SOURCE, as_file, owner
 
 UNKNOWN = [
     ("params: {registration: {kernal: 1}}", "params.registration.kernal", "params.registration.kernel"),
@@ -32,7 +32,7 @@ def test_unknown_key_names_file_key_and_nearest(text, key, nearest):
 def test_a_typing_slip_in_any_path_is_traced_back_to_it(path):
     slip = path[:-2] + path[-1] + path[-2] if path[-1] != path[-2] else path[:-1]
     with pytest.raises(UsageError, match="unknown key") as caught:
-        with_overrides(Settings(), [f"{slip}=1"])
+        with_overrides(owner(path), [f"{slip}=1"])
     assert f"'{path}'" in str(caught.value)
     assert "--set" in str(caught.value)
 

@@ -9,22 +9,33 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.param_values import DEFAULTS, invalid_value
-from lio_jax.core.params import Params, default_params, params_from_values, values_from_params
+from lio_jax.core.leaf import numbers_of, sections_of, settings_of, traced
+from lio_jax.recipes import RECIPES
+from tests.params import DEFAULTS, Params, default_params, params_from_values
 
 PATHS = [f"{section}.{name}" for section, leaves in DEFAULTS.items() for name in leaves]
 
 
-def test_values_round_trip():
-    assert values_from_params(params_from_values(DEFAULTS)) == DEFAULTS
+def problem(path: str, value: object) -> str:
+    """Return why a parameter's value is impossible, or nothing."""
+    return settings_of(Params)[path].declared.problem(value)
 
 
-def test_params_round_trip():
-    params = jax.tree.map(lambda leaf: leaf * 1.234567890123, default_params())
-    again = params_from_values(values_from_params(params))
-    assert jax.tree.structure(again) == jax.tree.structure(params)
-    for before, after in zip(jax.tree.leaves(params), jax.tree.leaves(again), strict=True):
-        np.testing.assert_array_equal(after, before)
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_every_setting_says_what_it_means(recipe):
+    for tree in (RECIPES[recipe].config_type, RECIPES[recipe].params_type):
+        for path, setting in settings_of(tree).items():
+            assert setting.doc.endswith("."), path
+            assert not setting.doc.startswith("Of "), path
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_numbers_and_arrays_are_the_same_values(recipe):
+    tree = RECIPES[recipe].params_type
+    params = traced(tree)
+    for section, leaves in numbers_of(tree).items():
+        for name, value in leaves.items():
+            np.testing.assert_array_equal(getattr(getattr(params, section), name), value)
 
 
 @pytest.mark.parametrize("path", PATHS)
@@ -48,7 +59,8 @@ def test_each_value_reaches_the_leaf_of_its_name(path):
 
 def test_defaults_name_every_leaf():
     for section in dataclasses.fields(Params):
-        assert set(DEFAULTS[section.name]) == {f.name for f in dataclasses.fields(section.type)}
+        kind = sections_of(Params)[section.name]
+        assert set(DEFAULTS[section.name]) == {f.name for f in dataclasses.fields(kind)}
     assert set(DEFAULTS) == {section.name for section in dataclasses.fields(Params)}
 
 
@@ -61,14 +73,15 @@ def test_dtype_follows_the_x64_flag(x64, dtype):
 @pytest.mark.parametrize("path", PATHS)
 def test_default_is_possible(path):
     section, name = path.split(".")
-    assert invalid_value(path, DEFAULTS[section][name]) == ""
+    assert problem(path, settings_of(Params)[path].declared.default) == ""
+    assert np.array_equal(DEFAULTS[section][name], settings_of(Params)[path].declared.default)
 
 
 @pytest.mark.parametrize(
     "path", [path for path in PATHS if not path.startswith(("extrinsics", "gps.lever_arm"))]
 )
 def test_negative_is_impossible(path):
-    assert "must" in invalid_value(path, -0.1)
+    assert "must" in problem(path, -0.1)
 
 
 @pytest.mark.parametrize(
@@ -76,21 +89,21 @@ def test_negative_is_impossible(path):
     ["lidar.range_sigma", "map.voxel_size", "map.reach", "registration.kernel", "registration.point_spacing"],
 )
 def test_zero_is_impossible_where_it_divides(path):
-    assert invalid_value(path, 0.0) == "must be greater than zero"
+    assert problem(path, 0.0) == "must be greater than zero"
 
 
 @pytest.mark.parametrize(
     "path", ["motion.error_decay", "registration.degeneracy_ratio", "registration.inertial_degeneracy_ratio"]
 )
 def test_fraction_is_at_most_one(path):
-    assert invalid_value(path, 1.0) == ""
-    assert invalid_value(path, 1.01) == "must be at most 1"
+    assert problem(path, 1.0) == ""
+    assert problem(path, 1.01) == "must be at most 1"
 
 
 def test_quaternion_has_unit_norm():
-    assert invalid_value("extrinsics.rotation", [0.6, 0.0, 0.0, 0.8]) == ""
-    assert "norm is 2" in invalid_value("extrinsics.rotation", [0.0, 0.0, 0.0, 2.0])
-    assert "unit quaternion" in invalid_value("extrinsics.rotation", [0.0, 0.0, 0.0, 0.0])
+    assert problem("extrinsics.rotation", [0.6, 0.0, 0.0, 0.8]) == ""
+    assert "norm is 2" in problem("extrinsics.rotation", [0.0, 0.0, 0.0, 2.0])
+    assert "unit quaternion" in problem("extrinsics.rotation", [0.0, 0.0, 0.0, 0.0])
 
 
 def test_extrinsic_pose_is_scipys():

@@ -12,15 +12,7 @@ from typing import Any
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import UsageError
-from lio_jax.data.foreign_rules import (
-    Rule,
-    System,
-    nothing,
-    quaternion,
-    rotation,
-    same,
-    vector,
-)
+from lio_jax.settings.foreign_rules import Rule, System, nothing, quaternion, rotation, same, vector
 
 _SAME_AXES = 0.02
 """Rotations are of the same axes if they differ by less, rad."""

@@ -6,8 +6,8 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.settings import Settings, recipe_settings, settings_from_yaml, with_overrides
-from lio_jax.data.foreign_settings import ForeignSettings, foreign_settings_from_yaml, load_foreign_settings
+from lio_jax.settings.settings import Settings, recipe_settings, settings_from_yaml, with_overrides
+from lio_jax.settings.translate import ForeignSettings, foreign_settings_from_yaml, load_foreign_settings
 from tests.data.foreign_files import FAST_LIO2_ROS1, FAST_LIO2_ROS2, LIO_SAM_ROS1, LIO_SAM_ROS2
 
 IDENTITY = [1, 0, 0, 0, 1, 0, 0, 0, 1]
@@ -49,10 +49,10 @@ def test_lio_sams_defaults_are_the_recipes_but_for_what_the_file_fixes(text):
                 f"{section}.{name}", own["params"][section][name]
             )
             np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12, err_msg=f"{section}.{name}")
-    assert settings.config.data.lidar_topic == "points_raw"
-    assert settings.config.data.imu_topic == "imu_raw"
-    assert settings.config.data.gps_topic == ""
-    assert not settings.config.backend.gps_elevation
+    assert settings.run.data.lidar_topic == "points_raw"
+    assert settings.run.data.imu_topic == "imu_raw"
+    assert settings.run.data.gps_topic == ""
+    assert not settings.run.backend.gps_elevation
     assert (settings.config.features.rings, settings.config.features.columns) == (16, 1800)
     assert settings.config.imu.heading
     assert not settings.config.imu.orientation
@@ -126,9 +126,9 @@ def test_fast_lio2s_values():
     assert settings.values["extrinsics"]["time_offset"] == 0.02
     assert settings.values["initial"]["extrinsic_rotation_sigma"] == 0.0
     assert settings.values["initial"]["extrinsic_translation_sigma"] == 0.0
-    assert settings.config.data.lidar_topic == "/livox/lidar"
-    assert settings.config.data.scan_period == 0.05
-    assert settings.config.data.time_unit == "auto"
+    assert settings.run.data.lidar_topic == "/livox/lidar"
+    assert settings.run.data.scan_period == 0.05
+    assert settings.run.data.time_unit == "auto"
 
 
 def test_fast_lio2s_values_for_ros2():
@@ -136,7 +136,7 @@ def test_fast_lio2s_values_for_ros2():
     own = recipe_settings("fast_lio2")
     for section in ("imu", "initial", "map", "registration", "point_map"):
         assert settings.values[section] == pytest.approx(own.values[section], rel=1e-12), section
-    assert settings.config.data.time_unit == "ns"
+    assert settings.run.data.time_unit == "ns"
     assert settings.config.fast_lio2.point_filter_num == 3
     assert settings.config.registration.max_iterations == own.config.registration.max_iterations
 
@@ -170,9 +170,9 @@ def test_what_is_mapped_can_be_overridden_and_written_and_read(text):
 def test_lio_sams_thresholds_of_gps():
     theirs = lio_sam(useGpsElevation=True, gpsCovThreshold=3.5, poseCovThreshold=9.0)
     settings = resolved(theirs)
-    assert settings.config.backend.gps_elevation
+    assert settings.run.backend.gps_elevation
     assert (settings.values["gps"]["max_variance"], settings.values["gps"]["pose_variance"]) == (3.5, 9.0)
-    assert not settings.config.backend.gps
+    assert not settings.run.backend.gps
     assert resolved(theirs, "default").values["gps"] == recipe_settings("default").values["gps"]
 
 

@@ -13,10 +13,10 @@ from typing import Any
 import yaml
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.settings import Settings, checked_together
-from lio_jax.data.fast_lio2_settings import FAST_LIO2
-from lio_jax.data.foreign_rules import Rule, System
-from lio_jax.data.lio_sam_settings import LIO_SAM
+from lio_jax.settings.foreign_rules import Rule, System
+from lio_jax.settings.from_fast_lio2 import FAST_LIO2
+from lio_jax.settings.from_lio_sam import LIO_SAM
+from lio_jax.settings.settings import Settings, checked_together
 
 SYSTEMS = (LIO_SAM, FAST_LIO2)
 

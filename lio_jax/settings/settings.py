@@ -1,72 +1,85 @@
-"""Settings of a run: recipe name, static config and traced parameters, read from YAML and checked strictly.
+"""Settings of a run: recipe, static config and traced parameters, read from YAML and checked strictly.
 
 A settings file has up to three keys::
 
-    recipe: default
-    config: {lidar: {registration_points: 4096}}
-    params: {registration: {kernel: 0.2}}
+recipe: default config: {lidar: {registration_points: 4096}} params: {registration: {kernel: 0.2}}
 
-Paths such as ``params.registration.kernel`` name the same values on the command line.
+Paths such as ``params.registration.kernel`` name the same values on the command line. Which paths there are
+is what the recipe and the parts of a run declare (:mod:`lio_jax.core.leaf`).
 """
 
 import dataclasses
 import difflib
 import math
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, get_origin
 
 import numpy as np
 import yaml
 
-from lio_jax.core.config import Config, invalid_config
 from lio_jax.core.errors import UsageError
-from lio_jax.core.param_values import DEFAULTS, invalid_value
-from lio_jax.core.params import Params, params_from_values
-from lio_jax.core.recipe_values import RECIPE_VALUES
+from lio_jax.core.leaf import Setting, choices, numbers_of, settings_of, traced
+from lio_jax.recipes import RECIPES, AnyRecipe, full_name, recipe_named
+from lio_jax.recipes.params import RecipeConfig, RecipeParams
+from lio_jax.settings.shared import GlobalParams, RunConfig
+
+Values = dict[str, dict[str, Any]]
+"""Plain numbers by section and name."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Everything that determines a run beside its data."""
+    """Everything that determines a run apart from its data; without arguments the default recipe's."""
 
     recipe: str = "default"
-    config: Config = field(default_factory=Config)
-    values: dict[str, dict[str, Any]] = field(default_factory=lambda: _copied(DEFAULTS))
-    """Traced parameters as plain numbers by section and name."""
+    """Name of a recipe, or ``FILE.py:CLASS``."""
+    config: RecipeConfig = field(default_factory=lambda: RECIPES["default"].config_type())
+    """Static settings of the recipe."""
+    run: RunConfig = field(default_factory=RunConfig)
+    """Static settings of the reader, the back end and the run folder."""
+    values: Values = field(default_factory=lambda: _numbers(RECIPES["default"]))
+    """Parameters of the recipe and of the back end as plain numbers."""
     given: frozenset[str] = frozenset()
     """Paths that were set by a file or an override, not by default."""
 
-    def params(self) -> Params:
-        """Return the traced parameters as a pytree."""
-        return params_from_values(self.values)
+    def params(self) -> RecipeParams:
+        """Return the recipe's traced parameters as a pytree of arrays."""
+        return traced(recipe_named(self.recipe).params_type, self.values)
 
     def with_value(self, path: str, value: Any, source: str) -> "Settings":
         """Return a copy with the value at a path such as ``config.map.capacity`` replaced.
 
-        Raises:
-            UsageError: the path is not known (names the nearest), or the value is impossible there.
+        Args:
+            path: as in a settings file, its keys joined by dots.
+            value: as YAML reads it.
+            source: what the message names when the value is impossible.
+
+        Raises: UsageError: the path is not known (names the nearest), the recipe does not read it, or the
+        value is impossible there.
         """
         place = f"{source}: {path}"
         if path == "recipe":
-            return dataclasses.replace(self, recipe=str(value))
-        if path not in _PATHS:
-            raise UsageError(f"{source}: unknown key '{path}'; {_nearest(path)}")
-        kind, section, *rest = path.split(".")
-        name = ".".join(rest)
+            chosen = full_name(str(value))
+            return self if chosen == self.recipe else recipe_settings(chosen)
+        known = _paths(recipe_named(self.recipe))
+        if path not in known:
+            raise UsageError(f"{source}: {_unknown(path, self.recipe)}")
+        kind, section, name = path.split(".")
         given = self.given | {path}
+        declared = known[path].declared
         if kind == "config":
-            group = getattr(self.config, section)
-            checked = _typed(value, _PATHS[path], place)
-            if problem := invalid_config(path, checked):
+            checked = _typed(value, known[path].type, place)
+            if problem := _sizes_problem(path, checked) or declared.problem(checked):
                 raise UsageError(f"{place} = {value!r} {problem}.")
-            config = dataclasses.replace(
-                self.config, **{section: dataclasses.replace(group, **{name: checked})}
-            )
-            return dataclasses.replace(self, config=config, given=given)
-        default = DEFAULTS[section][name]
-        checked = _number(value, default, place)
-        if problem := invalid_value(f"{section}.{name}", checked):
+            owner = "config" if hasattr(self.config, section) else "run"
+            tree = getattr(self, owner)
+            changed = dataclasses.replace(getattr(tree, section), **{name: checked})
+            tree = dataclasses.replace(tree, **{section: changed})
+            return dataclasses.replace(self, given=given, **{owner: tree})
+        checked = _number(value, declared.default, place)
+        if problem := declared.problem(checked):
             raise UsageError(f"{place} = {value!r} {problem}.")
         values = _copied(self.values)
         values[section][name] = checked
@@ -76,10 +89,11 @@ class Settings:
         """Return plain nested values, as they stand in a settings file."""
         config = {
             group.name: {
-                f.name: _plain(getattr(getattr(self.config, group.name), f.name))
-                for f in dataclasses.fields(getattr(self.config, group.name))
+                f.name: _plain(getattr(getattr(tree, group.name), f.name))
+                for f in dataclasses.fields(getattr(tree, group.name))
             }
-            for group in dataclasses.fields(self.config)
+            for tree in (self.run, self.config)
+            for group in dataclasses.fields(tree)
         }
         return {"recipe": self.recipe, "config": config, "params": _copied(self.values)}
 
@@ -87,13 +101,72 @@ class Settings:
         """Return the settings with every value resolved; :func:`settings_from_yaml` reads them back."""
         return yaml.safe_dump(self.as_dict(), sort_keys=False, default_flow_style=None, width=100)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # a recipe of a user's own file has no module that another process could import
+        return _rebuilt, (self.as_dict(), self.given)
+
+
+def recipe_of(settings: Settings) -> AnyRecipe:
+    """Return the recipe that settings name, with their static config."""
+    return recipe_named(settings.recipe)(settings.config)
+
 
 def recipe_settings(recipe: str) -> Settings:
-    """Return a recipe's own settings: the defaults with the values in which it differs."""
-    settings = Settings(recipe=recipe)
-    for path, value in RECIPE_VALUES.get(recipe, {}).items():
+    """Return a recipe's own settings.
+
+    Args:
+        recipe: a name, or ``FILE.py:CLASS``.
+
+    Raises:
+        UsageError: there is no such recipe.
+    """
+    chosen = recipe_named(recipe)
+    settings = Settings(full_name(recipe), chosen.config_type(), RunConfig(), _numbers(chosen))
+    for path, value in chosen.given_values.items():
         settings = settings.with_value(path, value, recipe)
     return dataclasses.replace(settings, given=frozenset())
+
+
+def declared_settings(recipe: str) -> dict[str, Setting]:
+    """Return every setting of a run with a recipe by path, such as ``params.map.voxel_size``."""
+    return _paths(recipe_named(recipe))
+
+
+def _rebuilt(tree: dict[str, Any], given: frozenset[str]) -> Settings:
+    settings = recipe_settings(tree["recipe"])
+    for path, value in _leaves({"config": tree["config"], "params": tree["params"]}, ""):
+        settings = settings.with_value(path, value, "settings")
+    return dataclasses.replace(settings, given=given)
+
+
+def _numbers(recipe: type[AnyRecipe]) -> Values:
+    return _copied(numbers_of(recipe.params_type) | numbers_of(GlobalParams))
+
+
+@cache
+def _paths(recipe: type[AnyRecipe]) -> dict[str, Setting]:
+    """Return what a run with a recipe can be told, by path."""
+    found: dict[str, Setting] = {}
+    for kind, trees in (
+        ("config", (RunConfig, recipe.config_type)),
+        ("params", (recipe.params_type, GlobalParams)),
+    ):
+        for tree in trees:
+            found |= {f"{kind}.{path}": setting for path, setting in settings_of(tree).items()}
+    return found
+
+
+def _unknown(path: str, recipe: str) -> str:
+    others = [name for name, other in RECIPES.items() if path in _paths(other)]
+    if others:
+        return f"the recipe {recipe} does not read '{path}' ({', '.join(others)} do); leave it out."
+    return f"unknown key '{path}'; {_nearest(path, recipe)}"
+
+
+def _sizes_problem(path: str, value: Any) -> str:
+    if path.endswith(".buckets") and (sorted(set(value)) != list(value) or value[0] < 1):
+        return "must be positive sizes in ascending order"
+    return ""
 
 
 def settings_from_yaml(text: str, source: str, base: Settings | None = None) -> Settings:
@@ -167,8 +240,8 @@ def checked_together(settings: Settings, source: str) -> Settings:
             f"{source}: params.lidar.min_range ({lidar['min_range']}) must be below "
             f"params.lidar.max_range ({lidar['max_range']})."
         )
-    features = settings.config.features
-    if 0 < features.columns <= 2 * features.neighbours:
+    features = getattr(settings.config, "features", None)
+    if features and 0 < features.columns <= 2 * features.neighbours:
         raise UsageError(
             f"{source}: config.features.columns ({features.columns}) must be more than twice "
             f"config.features.neighbours ({features.neighbours})."
@@ -176,25 +249,11 @@ def checked_together(settings: Settings, source: str) -> Settings:
     return settings
 
 
-def _copied(values: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def _copied(values: Values) -> Values:
     return {
         section: {name: list(value) if isinstance(value, list) else value for name, value in leaves.items()}
         for section, leaves in values.items()
     }
-
-
-def _leaf_types() -> dict[str, Any]:
-    paths: dict[str, Any] = {}
-    for group in dataclasses.fields(Config):
-        for leaf in dataclasses.fields(group.type):  # type: ignore[arg-type]
-            paths[f"config.{group.name}.{leaf.name}"] = leaf.type
-    for section, leaves in DEFAULTS.items():
-        for name in leaves:
-            paths[f"params.{section}.{name}"] = float
-    return paths
-
-
-_PATHS = _leaf_types()
 
 
 def _leaves(tree: dict[Any, Any], source: str, prefix: str = "") -> list[tuple[str, Any]]:
@@ -203,7 +262,7 @@ def _leaves(tree: dict[Any, Any], source: str, prefix: str = "") -> list[tuple[s
         path = f"{prefix}{key}"
         if isinstance(value, dict):
             found += _leaves(value, source, f"{path}.")
-        elif any(known.startswith(f"{path}.") for known in _PATHS):
+        elif any(known.startswith(f"{path}.") for known in _all_paths()):
             if value is not None:
                 raise UsageError(
                     f"{source}: {path} = {value!r} must hold keys, for example {_example(path)}."
@@ -213,12 +272,17 @@ def _leaves(tree: dict[Any, Any], source: str, prefix: str = "") -> list[tuple[s
     return found
 
 
+@cache
+def _all_paths() -> tuple[str, ...]:
+    return tuple(dict.fromkeys(path for recipe in RECIPES.values() for path in _paths(recipe)))
+
+
 def _example(path: str) -> str:
-    return next(known for known in _PATHS if known.startswith(f"{path}."))
+    return next(known for known in _all_paths() if known.startswith(f"{path}."))
 
 
-def _nearest(path: str) -> str:
-    known = ["recipe", *_PATHS]
+def _nearest(path: str, recipe: str) -> str:
+    known = ["recipe", *_paths(recipe_named(recipe))]
     by_name = {candidate.rsplit(".", 1)[-1]: candidate for candidate in known}
     close = difflib.get_close_matches(path, known, 1, 0.75)
     if not close:
@@ -231,12 +295,11 @@ def _nearest(path: str) -> str:
 
 def _typed(value: Any, kind: Any, place: str) -> Any:
     """Return ``value`` as the config field's type, or say what was expected."""
-    if get_origin(kind) is Literal:
-        choices = get_args(kind)
+    if allowed := choices(kind):
         if isinstance(value, bool):  # YAML 1.1 reads yes and no as booleans
             value = "yes" if value else "no"
-        if value not in choices:
-            raise UsageError(f"{place} = {value!r} must be one of {', '.join(map(str, choices))}.")
+        if value not in allowed:
+            raise UsageError(f"{place} = {value!r} must be one of {', '.join(map(str, allowed))}.")
         return value
     if get_origin(kind) is tuple:
         if not isinstance(value, list | tuple) or not value:
@@ -258,7 +321,7 @@ def _typed(value: Any, kind: Any, place: str) -> Any:
 
 def _number(value: Any, default: Any, place: str) -> Any:
     """Return ``value`` as a number or a list of as many numbers as the default has."""
-    if isinstance(default, list):
+    if isinstance(default, tuple):
         numbers = [_as_float(item) for item in value] if isinstance(value, list | tuple) else []
         if len(numbers) != len(default) or any(number is None for number in numbers):
             raise UsageError(f"{place} = {value!r} must be a list of {len(default)} numbers.")

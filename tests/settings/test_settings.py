@@ -1,6 +1,6 @@
 """Settings files and overrides: strict, and exact both ways."""
 
-import dataclasses
+import pickle
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -12,13 +12,13 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.config import Config
 from lio_jax.core.errors import UsageError
-from lio_jax.core.param_values import DEFAULTS
-from lio_jax.core.params import values_from_params
-from lio_jax.core.settings import (
+from lio_jax.recipes import RECIPES
+from lio_jax.settings.settings import (
     Settings,
+    declared_settings,
     load_settings,
+    recipe_settings,
     settings_from_yaml,
     with_extrinsics,
     with_overrides,
@@ -27,18 +27,17 @@ from lio_jax.core.settings import (
 SOURCE = "my.yaml"
 
 
-def config_fields() -> dict[str, Any]:
-    """Return each config path's type, read from the dataclasses."""
-    return {
-        f"config.{group.name}.{leaf.name}": leaf.type
-        for group in dataclasses.fields(Config)
-        for leaf in dataclasses.fields(group.type)
-    }
+OWNERS = {path: recipe for recipe in reversed(RECIPES) for path in declared_settings(recipe)}
+"""A recipe that reads a path."""
+DECLARED = {path: declared_settings(recipe)[path] for path, recipe in OWNERS.items()}
+PATHS = list(OWNERS)
+PARAMS = [path for path in PATHS if path.startswith("params.")]
+DEFAULT_PATHS = list(declared_settings("default"))
 
 
-CONFIG = config_fields()
-PARAMS = [f"params.{section}.{name}" for section, leaves in DEFAULTS.items() for name in leaves]
-PATHS = [*CONFIG, *PARAMS]
+def owner(path: str) -> Settings:
+    """Return settings of a recipe that reads a path."""
+    return recipe_settings(OWNERS[path])
 
 
 def value_at(settings: Settings, path: str) -> Any:
@@ -46,7 +45,8 @@ def value_at(settings: Settings, path: str) -> Any:
     kind, section, name = path.split(".")
     if kind == "params":
         return settings.values[section][name]
-    return getattr(getattr(settings.config, section), name)
+    tree = settings.config if hasattr(settings.config, section) else settings.run
+    return getattr(getattr(tree, section), name)
 
 
 def values_for(path: str) -> st.SearchStrategy:
@@ -57,7 +57,7 @@ def values_for(path: str) -> st.SearchStrategy:
         return st.lists(st.floats(-100, 100), min_size=3, max_size=3)
     if path in PARAMS:
         return st.floats(1e-6, 1.0) if path != "params.lidar.max_range" else st.floats(3.0, 500.0)
-    kind = CONFIG[path]
+    kind = DECLARED[path].type
     if path == "config.map.capacity":
         return st.integers(1, 24).map(lambda bits: 2**bits)
     if path == "config.knn.neighbours":
@@ -86,10 +86,10 @@ def expected(path: str, value: Any) -> Any:
 
 def as_file(path: str, value: Any) -> str:
     kind, section, name = path.split(".")
-    return yaml.safe_dump({kind: {section: {name: value}}})
+    return yaml.safe_dump({"recipe": OWNERS[path], kind: {section: {name: value}}})
 
 
-assignments = st.sampled_from(PATHS).flatmap(lambda path: st.tuples(st.just(path), values_for(path)))
+assignments = st.sampled_from(DEFAULT_PATHS).flatmap(lambda path: st.tuples(st.just(path), values_for(path)))
 
 
 @hypothesis_settings(max_examples=150, deadline=None, derandomize=True)
@@ -114,16 +114,16 @@ def test_an_override_and_a_file_set_the_same_value_and_nothing_else(pair):
     assert value_at(by_override, path) == expected(path, value)
     assert by_override == by_file
     assert by_file.given == {path}
-    untouched = [other for other in PATHS if other != path]
+    untouched = [other for other in DEFAULT_PATHS if other != path]
     assert all(value_at(by_file, other) == value_at(Settings(), other) for other in untouched)
 
 
 @pytest.mark.parametrize("path", PATHS)
 def test_every_path_takes_its_default_as_an_override(path):
-    default = value_at(Settings(), path)
+    default = value_at(owner(path), path)
     plain = list(default) if isinstance(default, tuple) else default
     text = yaml.safe_dump(plain, default_flow_style=True).removesuffix("...\n").strip()
-    assert value_at(with_overrides(Settings(), [f"{path}={text}"]), path) == default
+    assert value_at(with_overrides(owner(path), [f"{path}={text}"]), path) == default
 
 
 def test_documented_override_examples():
@@ -141,7 +141,7 @@ def test_documented_override_examples():
     assert settings.values["registration"]["kernel"] == 0.003
     assert settings.config.map.capacity == 65536
     assert settings.config.lidar.buckets == (1024, 2048)
-    assert settings.config.output.map is False
+    assert settings.run.output.map is False
 
 
 def test_later_override_wins():
@@ -160,7 +160,7 @@ def test_settings_are_values():
     base = Settings()
     changed = with_overrides(base, ["params.extrinsics.translation=[1,2,3]"])
     changed.values["extrinsics"]["translation"][0] = 9.0
-    assert base.values == Settings().values == DEFAULTS
+    assert base.values == Settings().values
 
 
 @pytest.mark.parametrize("text", ["", "# nothing\n", "params:\n", "params: {map: }\n", "config: {}\n"])
@@ -169,8 +169,24 @@ def test_an_empty_file_or_section_leaves_the_defaults(text):
 
 
 def test_params_hold_the_values():
-    settings = with_overrides(Settings(), ["params.registration.kernel=0.31"])
-    assert values_from_params(settings.params()) == settings.values
+    params = with_overrides(Settings(), ["params.registration.kernel=0.31"]).params()
+    assert float(params.registration.kernel) == 0.31
+
+
+def test_settings_of_a_recipe_hold_nothing_that_another_reads():
+    with pytest.raises(
+        UsageError, match=r"recipe default does not read 'params.knn.radius' \(fast_lio2, lio_sam"
+    ):
+        with_overrides(Settings(), ["params.knn.radius=1"])
+    assert "knn" not in Settings().as_dict()["params"]
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_settings_can_be_sent_to_another_process(recipe):
+    settings = with_overrides(
+        recipe_settings(recipe), ["params.map.voxel_size=0.77", "config.output.map=false"]
+    )
+    assert pickle.loads(pickle.dumps(settings)) == settings
 
 
 @pytest.mark.parametrize(
@@ -198,7 +214,7 @@ def test_exponents_that_yaml_reads_as_text_are_numbers(text):
         "kernel"
     ] == pytest.approx(1e-3, rel=1e-15)
     read = settings_from_yaml(f"config: {{output: {{keyframe_distance: {text}}}}}", SOURCE)
-    assert read.config.output.keyframe_distance == pytest.approx(1e-3, rel=1e-15)
+    assert read.run.output.keyframe_distance == pytest.approx(1e-3, rel=1e-15)
 
 
 def test_exponents_inside_a_list():
@@ -210,17 +226,17 @@ def test_exponents_inside_a_list():
     ("text", "value"), [("yes", "yes"), ("no", "no"), ("auto", "auto"), ("'yes'", "yes")]
 )
 def test_yes_and_no_are_words_where_words_are_wanted(text, value):
-    assert with_overrides(Settings(), [f"config.data.compensated={text}"]).config.data.compensated == value
+    assert with_overrides(Settings(), [f"config.data.compensated={text}"]).run.data.compensated == value
 
 
 @pytest.mark.parametrize(("text", "value"), [("yes", True), ("no", False), ("true", True), ("off", False)])
 def test_yes_and_no_are_booleans_where_booleans_are_wanted(text, value):
-    assert with_overrides(Settings(), [f"config.output.map={text}"]).config.output.map is value
+    assert with_overrides(Settings(), [f"config.output.map={text}"]).run.output.map is value
 
 
 def test_override_value_may_hold_an_equals_sign():
     settings = with_overrides(Settings(), ["config.data.lidar_topic=/a=b"])
-    assert settings.config.data.lidar_topic == "/a=b"
+    assert settings.run.data.lidar_topic == "/a=b"
 
 
 def test_file_is_read_from_disk_and_named_in_messages(tmp_path):

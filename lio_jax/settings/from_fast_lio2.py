@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.recipe_values import FAST_LIO2_IMU_RATE, RECIPE_VALUES, fast_lio2_density
-from lio_jax.data.foreign_rules import (
+from lio_jax.core.leaf import numbers_of
+from lio_jax.recipes.fast_lio2 import IMU_RATE, Params, density_of
+from lio_jax.settings.foreign_rules import (
     Rule,
     System,
     converted,
@@ -32,11 +33,11 @@ def _density(value: Any, place: str) -> float:
     variance = number(value, place)
     if variance <= 0:
         raise UsageError(f"{place} = {value!r} must be greater than zero.")
-    return fast_lio2_density(variance)
+    return density_of(variance)
 
 
 def _noise(path: str) -> Rule:
-    word = f"density, sqrt(cov / rate) at {FAST_LIO2_IMU_RATE:g} Hz: its covariances are of one step"
+    word = f"density, sqrt(cov / rate) at {IMU_RATE:g} Hz: its covariances are of one step"
     return converted(path, by=_density, word=word, method=True)
 
 
@@ -63,8 +64,10 @@ def _updates(value: Any, place: str) -> int:
 
 def _estimated(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
     if flag(value, place):
-        own = RECIPE_VALUES["fast_lio2"]
-        return {path: own[path] for path in _ESTIMATED}, "estimated where the sigma is not zero"
+        own = numbers_of(Params)["initial"]
+        return {
+            path: own[path.rpartition(".")[2]] for path in _ESTIMATED
+        }, "estimated where the sigma is not zero"
     return dict.fromkeys(_ESTIMATED, 0.0), "a sigma of zero keeps T_imu_lidar as it is"
 
 

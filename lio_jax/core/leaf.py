@@ -1,0 +1,224 @@
+"""One declaration for each setting: default, unit, bounds and how it is tuned stand at the field itself.
+
+A section is a class of settings that belong together: an :class:`equinox.Module` of traced parameters,
+declared by :func:`leaf`, or a frozen dataclass of static settings, declared by :func:`static`. A tree is a
+class whose fields are sections, declared by :func:`section`. The docstring of a setting is the string below
+its field.
+"""
+
+import ast
+import dataclasses
+import inspect
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from lio_jax.core.types import state_dtype
+
+Tuned = Literal["log", "linear", "turn"]
+_DECLARED = "lio_jax"
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What the code says about one setting."""
+
+    default: Any
+    """A number, a tuple of numbers, text or a truth value."""
+    unit: str = ""
+    """SI unit; empty where the number has none."""
+    above: float | None = None
+    """The value has to be larger than this."""
+    least: float | None = None
+    """The value must not be smaller than this."""
+    most: float | None = None
+    """The value must not be larger than this."""
+    why: str = ""
+    """Why the bound holds, for the message."""
+    tuned: Tuned | None = None
+    """How the value is tuned by gradient: its logarithm, itself, or as a rotation; None: it has no
+    derivative, because it chooses points, voxels, when to stop or what to report."""
+    power_of_two: bool = False
+    """The value is a power of two."""
+
+    def problem(self, value: Any) -> str:
+        """Return why a value is impossible ("must be ..."), or nothing if it is possible.
+
+        Args:
+            value: of the default's type.
+        """
+        if self.tuned == "turn":
+            norm = sum(x * x for x in value) ** 0.5
+            if abs(norm - 1) >= 1e-3:
+                return f"must be a unit quaternion x y z w (its norm is {norm:.4g})"
+        if self.power_of_two and (value < 2 or value & (value - 1)):
+            return "must be a power of two"
+        numbers = [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
+        for number in numbers:
+            if self.most is not None and number > self.most:
+                return f"must be at most {self.most:g}{self.why}"
+            if self.least is not None and number < self.least:
+                return (
+                    "must not be negative"
+                    if self.least == 0
+                    else f"must be at least {self.least:g}{self.why}"
+                )
+            if self.above is not None and number <= self.above:
+                return "must be greater than zero" if self.above == 0 else f"must be above {self.above:g}"
+        return ""
+
+
+def leaf(
+    default: float | Sequence[float],
+    unit: str = "",
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    most: float | None = None,
+    tuned: Tuned | None = None,
+) -> Any:
+    """Declare a traced parameter.
+
+    Args:
+        default: a number, or several for a vector.
+        unit: SI unit; empty where the number has none.
+        above: exclusive lower bound.
+        least: inclusive lower bound.
+        most: inclusive upper bound.
+        tuned: how the parameter is tuned by gradient; None: it has no derivative.
+    """
+    value = default if isinstance(default, int | float) else tuple(default)
+    declared = Declared(value, unit, above, least, most, "", tuned)
+    return eqx.field(default=value, metadata={_DECLARED: declared})
+
+
+def static(
+    default: Any,
+    unit: str = "",
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    why: str = "",
+    power_of_two: bool = False,
+) -> Any:
+    """Declare a static setting, which shapes arrays or chooses code.
+
+    Args:
+        default: a number, text, a truth value, or a tuple of sizes in ascending order.
+        unit: SI unit; empty where the number has none.
+        above: exclusive lower bound.
+        least: inclusive lower bound.
+        why: reason for the lower bound, for the message.
+        power_of_two: the value is one.
+    """
+    declared = Declared(default, unit, above, least, None, why and f": {why}", None, power_of_two)
+    return dataclasses.field(default=default, metadata={_DECLARED: declared})
+
+
+def section(kind: type, **defaults: Any) -> Any:
+    """Declare a section of a tree, with the defaults in which this tree differs from the section's own."""
+    unknown = set(defaults) - {field.name for field in dataclasses.fields(kind)}
+    if unknown:
+        raise TypeError(f"{kind.__name__} declares no {', '.join(sorted(unknown))}")
+    return dataclasses.field(default_factory=partial(kind, **defaults))
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One setting of a tree."""
+
+    path: str
+    """Section and name, such as ``map.voxel_size``."""
+    declared: Declared
+    """With the tree's own default."""
+    type: Any
+    """The field's annotation."""
+    doc: str
+    """The docstring of the field."""
+
+
+def sections_of(tree: Any) -> dict[str, type]:
+    """Return the sections of a tree by name."""
+    sections = {}
+    for place in dataclasses.fields(tree):
+        if place.default_factory is dataclasses.MISSING:
+            raise TypeError(f"{tree.__name__}.{place.name}: declare it by section(...)")
+        sections[place.name] = type(place.default_factory())
+    return sections
+
+
+@cache
+def settings_of(tree: Any) -> dict[str, Setting]:
+    """Return the settings of a tree by path, in the order of their declaration.
+
+    Args:
+        tree: a class whose fields are sections.
+    """
+    found: dict[str, Setting] = {}
+    defaults = tree()
+    for name, kind in sections_of(tree).items():
+        docs = _field_docs(kind)
+        for field in dataclasses.fields(kind):
+            default = getattr(getattr(defaults, name), field.name)
+            own = dataclasses.replace(field.metadata[_DECLARED], default=default)
+            path = f"{name}.{field.name}"
+            found[path] = Setting(path, own, field.type, docs.get(field.name, ""))
+    return found
+
+
+def numbers_of(tree: Any) -> dict[str, dict[str, Any]]:
+    """Return a tree's defaults as plain numbers and lists, by section and name."""
+    numbers: dict[str, dict[str, Any]] = {}
+    for path, setting in settings_of(tree).items():
+        place, name = path.split(".")
+        value = setting.declared.default
+        numbers.setdefault(place, {})[name] = list(value) if isinstance(value, tuple) else value
+    return numbers
+
+
+def traced(tree: type[T], values: Mapping[str, Mapping[str, Any]] | None = None) -> T:
+    """Return a tree of traced parameters as arrays in the state's precision.
+
+    Args:
+        tree: a class whose fields are sections of :func:`leaf`.
+        values: plain numbers by section and name, for at least the tree's sections. None: the defaults.
+    """
+    numbers = numbers_of(tree) if values is None else values
+    dtype = state_dtype()
+    return tree(
+        **{
+            name: kind(**{leaf: jnp.asarray(value, dtype) for leaf, value in numbers[name].items()})
+            for name, kind in sections_of(tree).items()
+        }
+    )
+
+
+def choices(kind: Any) -> tuple[Any, ...]:
+    """Return the values that an annotation allows where it lists them; else nothing."""
+    return get_args(kind) if get_origin(kind) is Literal else ()
+
+
+@cache
+def _field_docs(kind: type) -> dict[str, str]:
+    """Return the docstrings below the fields of a class and its bases."""
+    docs: dict[str, str] = {}
+    for one in reversed(kind.__mro__):
+        if "__annotations__" not in vars(one) or one.__module__.startswith("equinox"):
+            continue
+        body = ast.parse(textwrap.dedent(inspect.getsource(one))).body[0]
+        assert isinstance(body, ast.ClassDef)
+        for field, below in zip(body.body, body.body[1:], strict=False):
+            if (
+                isinstance(field, ast.AnnAssign)
+                and isinstance(field.target, ast.Name)
+                and isinstance(below, ast.Expr)
+                and isinstance(below.value, ast.Constant)
+            ):
+                docs[field.target.id] = " ".join(str(below.value.value).split())
+    return docs

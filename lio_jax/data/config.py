@@ -1,0 +1,38 @@
+"""How a recording is read."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from lio_jax.core.leaf import static
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """How a recording is read; "auto" or an empty string means: recognised from the data, and said."""
+
+    lidar_topic: str = static("")
+    """Bag topic of the point clouds; empty: the one with most messages."""
+    imu_topic: str = static("")
+    """Bag topic of the inertial samples; empty: the one with most messages."""
+    gps_topic: str = static("")
+    """Bag topic used as GPS; empty: a NavSatFix, or an Odometry whose name holds gps, gnss or rtk."""
+    time_field: str = static("")
+    """Name of the per-point time field; empty: t, time, timestamp, time_stamp, offset_time or timeOffset."""
+    time_unit: Literal["auto", "s", "ms", "us", "ns"] = static("auto")
+    """Unit of the per-point time field."""
+    time_reference: Literal["auto", "relative", "absolute"] = static("auto")
+    """Whether per-point times count from the scan or from the epoch."""
+    stamp_at: Literal["auto", "start", "end"] = static("auto")
+    """Which end of the scan the message's header stamp marks."""
+    accel_unit: Literal["auto", "m/s^2", "g"] = static("auto")
+    """Unit of the accelerometer."""
+    compensated: Literal["auto", "yes", "no"] = static("auto")
+    """Whether the recording's points are already motion compensated (KITTI odometry: yes)."""
+    vertical_correction_deg: float = static(0.205, "deg")
+    """Correction of the HDL-64E's elevation angles, applied to KITTI odometry scans only."""
+    beams: int = static(0, least=0)
+    """Beams for ring reconstruction where the recording holds no ring; 0: 16, 32 or 64 by the data."""
+    scan_period: float = static(0.1, "s", above=0)
+    """Duration of one sweep where it cannot be read from the data."""
+    prefetch: int = static(3, least=0)
+    """Number of scans decoded ahead on a thread."""

@@ -1,0 +1,64 @@
+"""Parameters and static settings of the default recipe."""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+
+from lio_jax.core.leaf import leaf, section, static
+from lio_jax.core.types import Scalar
+from lio_jax.imu.params import ImuConfig
+from lio_jax.lidar.params import BeamParams, ScanConfig
+from lio_jax.mapping.params import VoxelMapParams
+from lio_jax.recipes.params import InertialConfig, InertialParams, MotionParams
+from lio_jax.registration.params import FilterMatch, GaussNewtonMatch, RobustMatch, ThinnedMatch
+
+
+class InertialThinning(eqx.Module):
+    """Thinning of the scan where a filter predicts its pose."""
+
+    inertial_point_spacing: Scalar = leaf(0.5, "m", above=0)
+    """With inertial samples, the scan is thinned to one point per cube of this edge length before it is
+    matched: the prediction needs fewer points to correct it."""
+
+
+class VoxelMatch(GaussNewtonMatch, FilterMatch, ThinnedMatch, InertialThinning, RobustMatch):
+    """A match with the planes of a voxel map, by Gauss-Newton or in the filter."""
+
+
+class Params(InertialParams):
+    """Traced parameters of the default recipe."""
+
+    lidar: BeamParams = section(BeamParams)
+    map: VoxelMapParams = section(VoxelMapParams)
+    registration: VoxelMatch = section(VoxelMatch)
+    motion: MotionParams = section(MotionParams)
+
+
+@dataclass(frozen=True)
+class ThinnedScanConfig(ScanConfig):
+    """Capacities of the thinned scan without inertial samples."""
+
+    registration_points: int = static(12288, above=0)
+    """Capacity of the downsampled scan that is registered."""
+    insertion_points: int = static(32768, above=0)
+    """Capacity of the downsampled scan that is written into the map."""
+
+
+@dataclass(frozen=True)
+class ThinnedInertialConfig(ImuConfig):
+    """Capacities of the thinned scan with inertial samples."""
+
+    registration_points: int = static(2048, above=0)
+    """Capacity of the downsampled scan that is registered where there are inertial samples; it replaces
+    ``config.lidar.registration_points``."""
+    insertion_points: int = static(8192, above=0)
+    """Capacity of the downsampled scan that is written into the map where there are inertial samples; it
+    replaces ``config.lidar.insertion_points``."""
+
+
+@dataclass(frozen=True)
+class Config(InertialConfig):
+    """Static settings of the default recipe."""
+
+    lidar: ThinnedScanConfig = section(ThinnedScanConfig)
+    imu: ThinnedInertialConfig = section(ThinnedInertialConfig)

@@ -1,0 +1,92 @@
+"""Parameters and static settings of the recipe lio_sam, with LIO-SAM's values in SI units."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from lio_jax.core.leaf import section, static
+from lio_jax.estimation.params import SmootherParams
+from lio_jax.imu.params import ImuParams, InitialParams, OrientedImuConfig
+from lio_jax.lidar.params import LidarParams, LioSamFeatureParams, RingConfig
+from lio_jax.mapping.params import CubeParams, FeatureMapParams, MapConfig, SubmapParams
+from lio_jax.recipes.params import InertialConfig, InertialParams
+from lio_jax.registration.params import (
+    GaussNewtonMatch,
+    KnnConfig,
+    RegistrationConfig,
+    ScoredLineFitParams,
+    WeighedMatch,
+)
+
+_DEGREE = 3.141592653589793 / 180
+
+
+class Match(GaussNewtonMatch, WeighedMatch):
+    """A match of features by Gauss-Newton, whose result enters the smoother."""
+
+
+class Params(InertialParams):
+    """Traced parameters of LIO-SAM, in SI units."""
+
+    imu: ImuParams = section(
+        ImuParams,
+        gyro_noise=1.5636343949698187e-03,
+        accel_noise=3.9939570888238808e-03,
+        gyro_bias_walk=3.5640318696367613e-05,
+        accel_bias_walk=6.4356659353532566e-05,
+        gravity=9.80511,
+    )
+    # LIO-SAM's velocity sigma of 1e4 next to a sample's information is singular in double precision
+    initial: InitialParams = section(
+        InitialParams,
+        rotation_sigma=1e-2,
+        velocity_sigma=100.0,
+        gyro_bias_sigma=1e-3,
+        accel_bias_sigma=1e-3,
+    )
+    lidar: LidarParams = section(LidarParams, min_range=1.0, max_range=1000.0)
+    map: FeatureMapParams = section(FeatureMapParams, voxel_size=0.4, corner_voxel_size=0.2)
+    registration: Match = section(
+        Match,
+        reassociation_distance=0.05,
+        rotation_tolerance=0.05 * _DEGREE,
+        translation_tolerance=5e-4,
+    )
+    knn: ScoredLineFitParams = section(ScoredLineFitParams, radius=1.0, plane_tolerance=0.2, min_score=0.1)
+    features: LioSamFeatureParams = section(
+        LioSamFeatureParams, corner_threshold=1.0, flat_threshold=0.1, surface_spacing=0.4
+    )
+    # keyframes within 50 m see farther than that
+    point_map: CubeParams = section(CubeParams, cube_side_length=400.0)
+    submap: SubmapParams = section(SubmapParams)
+    smoother: SmootherParams = section(SmootherParams)
+
+
+@dataclass(frozen=True)
+class LioSamConfig:
+    """Smoother and capacities."""
+
+    window: int = static(10, least=2, why="the smoother ties each state to the one before it")
+    """Number of states that are smoothed together. Older states are marginalised."""
+    smoother_iterations: int = static(5, above=0)
+    """Largest number of linearisations of the window."""
+    lidar_noise: Literal["fixed", "information"] = static("fixed")
+    """Noise of a scan match in the smoother: the fixed sigmas of ``params.smoother``, or its information."""
+    keyframes: int = static(256, above=0)
+    """Capacity of keyframes. Beyond it the oldest keyframe is dropped, first among those that the submap no
+    longer needs."""
+    corner_points: int = static(2048, above=0)
+    """Capacity of the corners that are matched with the map, after thinning."""
+    surface_points: int = static(8192, above=0)
+    """Capacity of the surface points that are matched with the map, after thinning."""
+
+
+@dataclass(frozen=True)
+class Config(InertialConfig):
+    """Static settings of LIO-SAM."""
+
+    imu: OrientedImuConfig = section(OrientedImuConfig)
+    map: MapConfig = section(MapConfig, capacity=65536)
+    registration: RegistrationConfig = section(RegistrationConfig, max_iterations=30)
+    knn: KnnConfig = section(KnnConfig)
+    features: RingConfig = section(RingConfig, rings=0, columns=0, surface_points=0, order="azimuth")
+    lio_sam: LioSamConfig = section(LioSamConfig)
