@@ -19,7 +19,7 @@ def log_evidence(chain: Chain, smoothed: Smoothed) -> Float[Array, ""]:
     ``log p(z) = log p(z, x) + DOF n / 2 log(2 pi) - log|H| / 2`` at the most probable states x, with the
     Gauss-Newton Hessian H (MacKay, "Information theory, inference, and learning algorithms", 2003, chapter
     27). It is exact for a linear Gaussian model. A robust kernel changes the cost and the Hessian, but not
-    the normalisation of a measurement's density: an outlier still has a cost, but a bounded one. The
+    the normalisation of a measurement's density: an outlier keeps a cost, but does not dominate. The
     derivative is that of the solution and of the log-determinant; no iteration is differentiated.
 
     Args:

@@ -60,12 +60,12 @@ class NormalEquations(eqx.Module):
 
 
 class Directions(eqx.Module):
-    """Along which a step was taken."""
+    """The principal directions of a step."""
 
     vectors: Float[Array, "6 6"]
-    """In columns, scaled to metres."""
+    """Principal directions in columns, scaled to metres."""
     degenerate: Bool[Array, " 6"]
-    """Which of them the scan does not constrain: they were held."""
+    """True for directions that the scan does not constrain; the pose keeps the prediction along them."""
 
     @staticmethod
     def none(dtype: jnp.dtype) -> "Directions":
@@ -112,7 +112,7 @@ def unmet(
     """Return what vanishes at a solution: the gradient where observed, else the way from the prediction.
 
     Args:
-        T_world_lidar: a pose at the solution or beside it.
+        T_world_lidar: a pose at the solution or near it.
         T_predicted: what the solve began at.
         directions: of its last step.
         gradient: at ``T_world_lidar``.

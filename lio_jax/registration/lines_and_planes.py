@@ -41,7 +41,7 @@ class FeaturePoints(eqx.Module):
 
 
 class Frames(eqx.Module):
-    """Of the lines and of the planes: they may come from maps with different grids."""
+    """The frames of the lines and of the planes, which may come from maps with different grids."""
 
     corner: Frame
     surface: Frame
@@ -87,7 +87,7 @@ def fit_lines(
     It passes through the points' centre along the eigenvector of their largest variance.
 
     Args:
-        x: m; y and z likewise.
+        x: m, as are y and z.
 
     Returns:
         The lines, all called valid, their directions, and the columns' variances in ascending order, m^2.
@@ -129,14 +129,14 @@ def lines_near(
 
 
 Weight = Callable[[Float[Array, " k"], Float[Array, " k"]], Float[Array, " k"]]
-"""Of a residual, by its squared distance and the point's squared range, m^2."""
+"""Weight of a residual as a function of its squared distance (m^2) and the point's squared range (m^2)."""
 
 
 class Weights(NamedTuple):
     """Robust weights of either kind's distances."""
 
     corner: Weight
-    """A line's two distances share one."""
+    """Weight of a line; both of its distances have the same."""
     surface: Weight
 
 
@@ -219,7 +219,7 @@ class _Rows(eqx.Module):
     """Distances of points from planes, and their derivatives."""
 
     columns: Float[Array, "7 k"]
-    """By a turn about the sensor and by a move, in world axes; then the distance, m. Zero without a match."""
+    """Derivatives of the distance by rotation and translation, in world axes; then the distance, m."""
     distance: Float[Array, " k"]
     range_squared: Float[Array, " k"]
 
