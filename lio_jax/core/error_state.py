@@ -130,6 +130,7 @@ class NavEstimate(eqx.Module):
     """A navigation state and the covariance of its error."""
 
     nav: NavState
+    """The estimated state."""
     covariance: Float[Array, "24 24"]
     """Covariance of the error state, in the order, units and frames of this module's slices."""
 
@@ -138,6 +139,7 @@ class SweptState(eqx.Module):
     """A navigation state at a sweep's end, with the joint covariance of its error and of ``LAG``."""
 
     nav: NavState
+    """The estimated state at the sweep's end."""
     covariance: Float[Array, "30 30"]
     """Covariance of the 24 entries of the error state, then of the six of ``LAG``."""
 

@@ -41,7 +41,7 @@ class State(recipe.State):
     """What is carried from scan to scan."""
 
     nav: NavState
-    """At the last scan's end."""
+    """State at the last scan's end."""
     covariance: Float[Array, "24 24"]
     """Covariance of the state's error within the map."""
     drift: MapDrift

@@ -25,7 +25,7 @@ class State(recipe.State):
     """What is carried from scan to scan."""
 
     nav: NavState
-    """At the last scan's end."""
+    """State at the last scan's end."""
     T_world_lidar: jaxlie.SE3
     """Pose at the middle of the last scan, which registration finds: deskewing has the least error there."""
     mid_to_end: Float[Array, ""]

@@ -27,6 +27,7 @@ class Output(eqx.Module):
     """The output of a step for one scan."""
 
     registration: Registration
+    """Result of the scan match."""
     lost: Bool[Array, ""]
     """True if the scan could not be matched; the pose is then the prediction, and the map did not change."""
     nis: Float[Array, ""]
@@ -36,6 +37,7 @@ class Output(eqx.Module):
     points: Float[Array, "m 3"]
     """The thinned scan, motion compensated, in world axes from ``origin``, m."""
     points_mask: Bool[Array, " m"]
+    """True where a row of ``points`` is real."""
     added: Bool[Array, " m"]
     """True for ``points`` that were new to the map."""
     origin: Float[Array, "3"]

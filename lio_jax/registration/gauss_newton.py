@@ -20,6 +20,7 @@ class Registration(eqx.Module):
     """Result of a scan-to-map solve."""
 
     T_world_lidar: jaxlie.SE3
+    """Estimated pose of the lidar, m."""
     information: Float[Array, "6 6"]
     """Inverse covariance of the right perturbation, rotation (rad) before translation (m)."""
     degenerate: Bool[Array, " 6"]
@@ -29,6 +30,7 @@ class Registration(eqx.Module):
     rmse: Float[Array, ""]
     """Robustly weighted root mean square distance to the map, m."""
     iterations: Int32[Array, ""]
+    """Number of Gauss-Newton steps."""
     status: Int32[Array, ""]
     """CONVERGED, ITERATION_LIMIT or TOO_FEW_MATCHES; in the last case the pose is the prediction."""
 
@@ -37,8 +39,11 @@ class NormalEquations(eqx.Module):
     """The solve linearised at one pose, in world axes at the sensor's position."""
 
     hessian: Float[Array, "6 6"]
+    """Gauss-Newton Hessian of half the weighted squared error."""
     gradient: Float[Array, "6"]
+    """Gradient of half the weighted squared error."""
     matches: Int32[Array, ""]
+    """Number of matched points."""
     weight: Float[Array, ""]
     """Sum of the robust weights."""
     squared_error: Float[Array, ""]

@@ -21,9 +21,11 @@ class Planes(eqx.Module):
     """The plane that each point lies on, in world axes from the frame's origin."""
 
     normal: Float32[Array, "k 3"]
+    """Unit normal of each plane."""
     offset: Float32[Array, " k"]
     """The plane is where normal'p + offset = 0, m."""
     valid: Bool[Array, " k"]
+    """True where a point has a plane."""
 
 
 def no_planes(mask: Bool[Array, " k"]) -> Planes:

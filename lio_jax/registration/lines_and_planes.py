@@ -28,23 +28,31 @@ class Lines(eqx.Module):
     """The line that each point lies on, as two planes; both have the same ``valid``."""
 
     first: Planes
+    """First plane through each line."""
     second: Planes
+    """Second plane through each line, normal to the first."""
 
 
 class FeaturePoints(eqx.Module):
     """Corners and surface points of a scan, m, lidar frame of one instant."""
 
     corner: Float[Array, "c 3"]
+    """Corners, m."""
     corner_mask: Bool[Array, " c"]
+    """True where a corner is real."""
     surface: Float[Array, "s 3"]
+    """Surface points, m."""
     surface_mask: Bool[Array, " s"]
+    """True where a surface point is real."""
 
 
 class Frames(eqx.Module):
     """The frames of the lines and of the planes, which may come from maps with different grids."""
 
     corner: Frame
+    """Frame of the lines."""
     surface: Frame
+    """Frame of the planes."""
 
 
 class LinesAndPlanes(eqx.Module):
@@ -138,6 +146,7 @@ class Weights(NamedTuple):
     corner: Weight
     """Weight of a line; both of its distances have the same."""
     surface: Weight
+    """Weight of a plane's distance."""
 
 
 def huber(kernel: Float[Array, ""]) -> Weights:

@@ -26,7 +26,7 @@ class PointEvidence(eqx.Module):
     log_det: Float[Array, ""]
     """Weighted sum of the logarithms of the noise's variances (m^2)."""
     scale: Float[Array, ""]
-    """How many points each counts as, ``registration.information_scale``."""
+    """Factor of each point's information, ``registration.information_scale``."""
 
 
 def point_evidence(

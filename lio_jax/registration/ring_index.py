@@ -41,9 +41,11 @@ class RingIndex(eqx.Module):
     """Clouds sorted for the search; masked points come last."""
 
     x: Float32[Array, " m"]
-    """m."""
+    """Coordinate x of each point, m."""
     y: Float32[Array, " m"]
+    """Coordinate y of each point, m."""
     z: Float32[Array, " m"]
+    """Coordinate z of each point, m."""
     ring: Int32[Array, " m"]
     """Ring of each point; -1 where there is no point."""
     azimuth: Float32[Array, " m"]
@@ -67,9 +69,11 @@ class Queries(eqx.Module):
     """Points whose neighbours are sought."""
 
     x: Float32[Array, " k"]
-    """m, in the index's frame."""
+    """Coordinate x of each query, m, in the index's frame."""
     y: Float32[Array, " k"]
+    """Coordinate y of each query, m, in the index's frame."""
     z: Float32[Array, " k"]
+    """Coordinate z of each query, m, in the index's frame."""
     lowest: Int32[Array, " k"]
     """First ring of the cloud to search."""
 
@@ -83,6 +87,7 @@ class Nearest(eqx.Module):
     """Places of points in an index, -1 where there is none within the radius."""
 
     nearest: Int32[Array, " k"]
+    """Place of the nearest point."""
     same_ring: Int32[Array, " k"]
     """Place of the next nearest point in the ring of the nearest one."""
     other_ring: Int32[Array, " k"]

@@ -58,11 +58,13 @@ class Matches(eqx.Module):
     mean: Float32[Array, "k 3"]
     """m."""
     normal: Float32[Array, "k 3"]
+    """Unit normal of each voxel's plane."""
     variances: Float32[Array, "k 2"]
     """The voxel's two smaller variances, ascending, m^2."""
     count: Float32[Array, " k"]
     """Number of points of the voxel."""
     used: Bool[Array, " k"]
+    """True where a point has a match."""
 
 
 def associate(
