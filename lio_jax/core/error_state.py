@@ -1,7 +1,8 @@
 """The 24-dimensional error state of the navigation state: its order, retraction and inverse.
 
-Right perturbation: R Exp(dtheta), p + R dp, v + R dv (gtsam's NavState), biases and translations added,
-gravity turned on its sphere: g <- Exp(B du) g with B a basis of the plane normal to g.
+The error is a right perturbation: R Exp(dtheta), p + R dp, v + R dv (gtsam's NavState). The errors of the
+biases, of the extrinsic translation and of the time offset are added. Gravity turns on its sphere:
+g <- Exp(B du) g, where the columns of B are a basis of the plane normal to g.
 """
 
 import equinox as eqx
@@ -15,31 +16,37 @@ from lio_jax.core.types import NavState
 
 DOF = 24
 ROTATION = slice(0, 3)
-"""rad, IMU frame."""
+"""Rotation of T_world_imu, rad, IMU frame."""
 POSITION = slice(3, 6)
-"""m, IMU frame."""
+"""Position of T_world_imu, m, IMU frame."""
 VELOCITY = slice(6, 9)
-"""m/s, IMU frame."""
+"""Velocity of the IMU's origin, m/s, IMU frame."""
 GYRO_BIAS = slice(9, 12)
-"""rad/s."""
+"""Bias of the gyroscope, rad/s, IMU frame."""
 ACCEL_BIAS = slice(12, 15)
-"""m/s^2."""
+"""Bias of the accelerometer, m/s^2, IMU frame."""
 BIASES = slice(9, 15)
-"""Both of them."""
+"""Bias of the gyroscope (rad/s), then of the accelerometer (m/s^2), IMU frame."""
 GRAVITY = slice(15, 17)
-"""rad, about the two axes of ``sphere_basis``."""
+"""Direction of gravity, rad, about the two axes of :func:`sphere_basis`."""
 EXTRINSIC_ROTATION = slice(17, 20)
-"""rad, lidar frame."""
+"""Rotation of T_imu_lidar, rad, lidar frame."""
 EXTRINSIC_TRANSLATION = slice(20, 23)
-"""m, IMU frame."""
+"""Translation of T_imu_lidar, m, IMU frame."""
 TIME_OFFSET = slice(23, 24)
-"""s."""
+"""Lag of the lidar's clock, s."""
 LAG = slice(24, 30)
-"""Behind the state's own error in :class:`SweptState`: rotation (rad) and position (m), IMU frame."""
+"""Error of the pose at a sweep's end less the mean of that error over the sweep, the last six entries of
+:class:`SweptState`'s error: rotation (rad), then position (m), IMU frame."""
 
 
 def retract(nav: NavState, error: Float[Array, "24"]) -> NavState:
-    """Return ``nav [+] error``."""
+    """Return the state ``nav [+] error``.
+
+    Args:
+        nav: the state to perturb.
+        error: in the order, units and frames of this module's slices.
+    """
     rotation, extrinsic = nav.T_world_imu.rotation(), nav.T_imu_lidar.rotation()
     fall = sphere_basis(nav.gravity) @ error[GRAVITY]
     # in batches, because each operation on its own compiles a kernel
@@ -60,7 +67,15 @@ def retract(nav: NavState, error: Float[Array, "24"]) -> NavState:
 
 
 def local(origin: NavState, nav: NavState) -> Float[Array, "24"]:
-    """Return the error with ``retract(origin, error) == nav``: ``nav [-] origin``."""
+    """Return the error ``nav [-] origin``, for which ``retract(origin, error) == nav``.
+
+    Args:
+        origin: the state to which the error refers.
+        nav: the other state; its gravity is of the same magnitude as that of ``origin``.
+
+    Returns:
+        The error in the order, units and frames of this module's slices.
+    """
     rotation = origin.T_world_imu.rotation()
     back = rotation.inverse()
     extrinsic = origin.T_imu_lidar.rotation().inverse() @ nav.T_imu_lidar.rotation()
@@ -80,7 +95,11 @@ def local(origin: NavState, nav: NavState) -> Float[Array, "24"]:
 
 
 def sphere_basis(gravity: Float[Array, "3"]) -> Float[Array, "3 2"]:
-    """Return two unit axes normal to ``gravity`` and to each other, smooth near the vertical."""
+    """Return two unit axes normal to ``gravity`` and to each other, which vary smoothly near the vertical.
+
+    Args:
+        gravity: m/s^2, in world; it must not point straight up, where the axes are singular.
+    """
     up = -gravity / jnp.linalg.norm(gravity)
     # the rotation that takes +z to up, applied to x and y; singular only for gravity that points up
     axes = np.eye(3, dtype=up.dtype)
@@ -89,7 +108,7 @@ def sphere_basis(gravity: Float[Array, "3"]) -> Float[Array, "3 2"]:
 
 
 def _unit(rotation: jaxlie.SO3) -> jaxlie.SO3:
-    """Return the rotations at unit length, to the last bit as they are where that is their length."""
+    """Return the rotations at unit length; where the length is one up to rounding, no bit changes."""
     square = jnp.sum(rotation.wxyz**2, axis=-1, keepdims=True)
     # dividing by a norm that is one but for rounding would let a frozen rotation's last bits wander
     as_it_is = jnp.abs(square - 1) < 8 * jnp.finfo(square.dtype).eps
@@ -111,21 +130,24 @@ class NavEstimate(eqx.Module):
     """A navigation state and the covariance of its error."""
 
     nav: NavState
+    """The estimated state."""
     covariance: Float[Array, "24 24"]
+    """Covariance of the error state, in the order, units and frames of this module's slices."""
 
 
 class SweptState(eqx.Module):
-    """A navigation state at a sweep's end, and how its pose's error there differs from the sweep's mean."""
+    """A navigation state at a sweep's end, with the joint covariance of its error and of ``LAG``."""
 
     nav: NavState
+    """The estimated state at the sweep's end."""
     covariance: Float[Array, "30 30"]
-    """Of the error, and of what the pose's error is ahead of its mean over the sweep's points (``LAG``)."""
+    """Covariance of the 24 entries of the error state, then of the six of ``LAG``."""
 
     @staticmethod
     def at_once(state: NavEstimate) -> "SweptState":
-        """Return a state that is seen at one instant."""
+        """Return ``state`` for a sweep without duration: its ``LAG`` is zero without uncertainty."""
         return SweptState(state.nav, jnp.pad(state.covariance, (0, LAG.stop - LAG.start)))
 
     def at_end(self) -> NavEstimate:
-        """Return the state at the sweep's end alone."""
+        """Return the state at the sweep's end, without ``LAG``."""
         return NavEstimate(self.nav, self.covariance[:DOF, :DOF])

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all: written aside in the same folder, then renamed."""
+"""Write files atomically: under a temporary name in the same folder, then renamed."""
 
 import fcntl
 import os
@@ -14,9 +14,10 @@ _TOKEN_BYTES = 4
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``; rename it onto ``path`` if the block ends without an exception.
+    """Yield a temporary path in the folder of ``path``; rename it to ``path`` if the block raises nothing.
 
-    The temporary keeps the suffix, because some writers choose their format by it.
+    The temporary path keeps the suffix, because some writers choose their format by it. It is removed if the
+    block raises.
     """
     aside = aside_of(path)
     try:
@@ -27,15 +28,15 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def aside_of(path: Path) -> Path:
-    """Return a hidden name beside ``path`` that nobody else has."""
+    """Return a hidden, unique name in the folder of ``path``."""
     return path.with_name(f".{path.stem}.{secrets.token_hex(_TOKEN_BYTES)}{path.suffix}")
 
 
 def remove_leftovers(path: Path) -> None:
-    """Remove the files and folders that killed writers of ``path`` left under a name of :func:`aside_of`.
+    """Remove the files and folders that interrupted writers of ``path`` left behind.
 
-    Folders whose lock is held stay. Files have none: only for a caller who knows that no other writer of
-    ``path`` is at work.
+    They have a name of :func:`aside_of`. Folders whose lock is held are kept. Files have no lock, so the
+    caller must know that no other process writes ``path``.
     """
     name = re.compile(rf"\.{re.escape(path.stem)}\.[0-9a-f]{{{2 * _TOKEN_BYTES}}}{re.escape(path.suffix)}")
     for entry in path.parent.iterdir():
@@ -52,8 +53,8 @@ def remove_leftovers(path: Path) -> None:
 def folder_lock(folder: Path) -> Iterator[bool]:
     """Hold the folder's lock during the block; yield whether it was free.
 
-    The system releases it when the process ends, however that happens. Where the file system knows no locks
-    the folder is taken to be free.
+    The system releases the lock when the process ends, also when it is killed. Where the file system supports
+    no locks, the folder counts as free.
     """
     descriptor = os.open(folder, os.O_RDONLY)
     try:

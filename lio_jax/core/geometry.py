@@ -1,4 +1,4 @@
-"""Rotation matrices, 3 x 3 symmetric eigenproblems in closed form, and matrices put together from blocks."""
+"""Small matrices: cross products, rotations, symmetric 3 x 3 eigenproblems, and matrices from blocks."""
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +13,13 @@ _SIGN = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]], np.int32)
 
 
 def skew(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
-    """Return the matrix whose product with w is ``vector`` x w."""
+    """Return the skew-symmetric matrix whose product with a vector w is the cross product ``vector`` x w."""
     return jnp.take(vector, _ENTRY, axis=-1, mode="clip") * _SIGN
 
 
 @jax.jit
 def rotation_matrix(rotation: jaxlie.SO3) -> Float[Array, "*b 3 3"]:
-    """Return the matrix of a quaternion (w, v), whatever its length.
+    """Return the rotation matrix of a quaternion (w, v) of any length above zero.
 
     ``R = (2 w^2 / n - 1) I + 2 / n (v v' + w V)`` with V the cross product with v and n = w^2 + v'v.
     """
@@ -36,11 +36,16 @@ def eigenvalues_and_normal3(
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
     """Return ascending eigenvalues and the unit eigenvector of the smallest one, without LAPACK.
 
-    The eigenvalue that stands apart from the other two comes from the trigonometric solution of the
-    characteristic cubic (Smith, "Eigenvalues of a symmetric 3 x 3 matrix", CACM 1961) and its eigenvector
-    from the longest cross product of two rows of A - lambda I; the other two come from the 2x2 problem in
-    the plane across it (Eberly, "A robust eigensolver for 3 x 3 symmetric matrices", 2014). Flat, thin and
-    round voxels are all solved to float32's precision. Where all three coincide the eigenvector is (0, 0, 1).
+    The eigenvalue farthest from the other two comes from the trigonometric solution of the characteristic
+    cubic (Smith, "Eigenvalues of a symmetric 3 x 3 matrix", CACM 1961). Its eigenvector is the longest cross
+    product of two rows of A - lambda I. The other two eigenvalues come from the 2 x 2 problem in the plane
+    normal to that eigenvector (Eberly, "A robust eigensolver for 3 x 3 symmetric matrices", 2014). The result
+    has float32's precision for flat, thin and round distributions. Where all three eigenvalues coincide, the
+    eigenvector is (0, 0, 1).
+
+    Args:
+        diagonal: entries xx, yy and zz of the symmetric matrix.
+        off_diagonal: entries xy, xz and yz.
     """
     tiny = jnp.finfo(diagonal.dtype).tiny
     mean = jnp.mean(diagonal, -1)
@@ -76,7 +81,7 @@ def eigenvalues_and_normal3(
     middle, half = (uu + vv) / 2, (uu - vv) / 2
     radius = jnp.sqrt(jnp.maximum(half**2 + uv**2, 1e-30))
     low, high = middle - radius, middle + radius
-    # of the two rows of the 2x2 problem the one that does not cancel
+    # one of the two rows of the 2x2 problem suffers no cancellation: take that one
     along_u = jnp.where(half > 0, uv, radius - half)
     along_v = jnp.where(half > 0, -(half + radius), -uv)
     lowest = along_u[..., None] * u + along_v[..., None] * v
@@ -86,7 +91,11 @@ def eigenvalues_and_normal3(
 
 
 def across(axis: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
-    """Return two unit vectors that are perpendicular to a unit vector and to each other."""
+    """Return two unit vectors that are perpendicular to a unit vector and to each other.
+
+    Args:
+        axis: of unit length.
+    """
     x, y, z = jnp.moveaxis(axis, -1, 0)
     zero = jnp.zeros_like(x)
     slanted = (jnp.abs(x) > jnp.abs(y))[..., None]
@@ -110,13 +119,13 @@ def _longest(*candidates: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
 def from_blocks(
     shape: tuple[int, int], *blocks: tuple[slice, slice, Float[Array, "_ _"]]
 ) -> Float[Array, "n m"]:
-    """Return the matrix that is zero but for the given blocks; those that overlap add up.
+    """Return a matrix of the given blocks and zeros elsewhere; blocks that overlap are added.
 
-    All of it is one kernel, where setting block after block compiles a kernel for each.
+    The whole matrix is one compiled kernel. Setting the blocks one by one would compile a kernel for each.
 
     Args:
-        shape: of the matrix.
-        blocks: rows, columns and what stands there; all of one dtype.
+        shape: number of rows and columns of the matrix.
+        blocks: the rows, the columns and the entries of each block; all entries have one dtype.
     """
     padded = []
     for rows, columns, block in blocks:

@@ -5,10 +5,10 @@ from jaxtyping import Array, Int32, UInt32
 
 
 def voxel_hash(voxel: Int32[Array, "*b 3"]) -> UInt32[Array, "*b"]:
-    """Mix integer voxel coordinates into 32 bits.
+    """Return a 32-bit hash of integer voxel coordinates.
 
-    A sum of products with large odd numbers, then the finaliser of MurmurHash3, so that the low bits, which
-    pick the slot, depend on all bits of the coordinates.
+    The hash is a sum of products with large odd numbers, followed by the finaliser of MurmurHash3. So its low
+    bits, which choose the slot, depend on all bits of the coordinates.
     """
     x, y, z = (voxel[..., axis].astype(jnp.uint32) for axis in range(3))
     h = x * jnp.uint32(0x8DA6B343) + y * jnp.uint32(0xD8163841) + z * jnp.uint32(0xCB1AB31F)

@@ -1,7 +1,7 @@
 """Derivatives of converged solves by the implicit function theorem, and of values that are already known.
 
-Nothing here differentiates an iteration. Both rules work forwards and backwards, and what a batch of tangents
-has in common is computed once.
+No iteration is differentiated. Both rules support forward and reverse mode. A batch of tangents shares the
+work that does not depend on the tangent.
 """
 
 from collections.abc import Callable
@@ -16,45 +16,52 @@ _Value = TypeVar("_Value")
 
 
 class Solution(NamedTuple):
-    """What a solve found."""
+    """The result of a solve."""
 
     root: Float[Array, " d"]
+    """The unknowns at which the residual is zero."""
     selection: Any
-    """Choices made on the way, such as associations: constants of the derivative."""
+    """Discrete choices of the solve, such as associations. The derivative takes them as constant."""
     reported: Any
-    """By-products at the root."""
+    """Further values at the root, which have a derivative as well."""
 
 
 class Problem(eqx.Module):
     """A solve and the equations that its result satisfies.
 
-    Its functions must not close over arrays that are differentiated: those belong into ``inputs``.
+    Its functions must not close over arrays that are differentiated: such arrays belong in ``inputs``.
     """
 
     solve: Callable[[Any], Solution]
-    """``inputs ->`` the solution, by whatever iteration."""
+    """``inputs -> solution``. It may use any iteration."""
     probe: Callable[[Array, Any, Any], Any]
-    """``(root, selection, inputs) ->`` all that is costly in residual and report."""
+    """``(root, selection, inputs) -> probed``: the costly values that residual and report share."""
     residual: Callable[[Array, Any, Any, Any], Array]
-    """``(root, probed, selection, inputs) ->`` d values, zero at the root."""
+    """``(root, probed, selection, inputs) -> (d,)`` values, which are zero at the root."""
     report: Callable[[Array, Any, Any, Any], Any]
-    """``(root, probed, selection, inputs) ->`` what ``solve`` reports, as a function of the root."""
+    """``(root, probed, selection, inputs) -> reported``: the values that ``solve`` reports, as a function of
+    the root."""
     directions: Callable[[Array, Any], tuple[Array, Array]] | None = None
-    """``(root, inputs) -> B (d, k), C (k, d)``: the probe feels a step dx of the root as it would B C dx, so
-    that k of its derivatives will do. None: the identity."""
+    """``(root, inputs) -> B (d, k), C (k, d)``: the derivative of the probe with respect to the root is the
+    same along dx and along B C dx, so its derivatives along the k columns of B suffice. None: B and C are the
+    identity."""
     inverse_slope: Callable[[Array, Any, Any, Array], Array] | None = None
-    """``(root, selection, inputs, right) -> (dr/dx)^-1 right`` for a symmetric dr/dx whose structure makes
-    this cheaper than a dense factorisation, such as that of a chain. It is taken as constant: the derivative
-    has none of its own."""
+    """``(root, selection, inputs, right) -> (dr/dx)^-1 right``, for a symmetric dr/dx whose structure, for
+    example that of a chain, makes this cheaper than a dense factorisation. Its arguments are held constant:
+    it is not differentiated itself."""
 
 
 def implicit(problem: Problem, inputs: Any) -> Solution:
     """Return the problem's solution with the derivative of the root of ``residual = 0``.
 
     By the implicit function theorem dx = -(dr/dx)^-1 (dr/dinputs) dinputs (Krantz & Parks, "The implicit
-    function theorem", 2002), which costs one d by d factorisation however many iterations the solve took and
-    however many tangents there are. It is the derivative of a *converged* solve: carry the solve's status
-    along and don't trust the derivative where it did not converge.
+    function theorem", 2002). The cost is one d by d factorisation; it does not depend on the number of
+    iterations of the solve, nor on the number of tangents. The result is the derivative of a *converged*
+    solve: check the solve's status, and do not use the derivative where the solve did not converge.
+
+    Args:
+        problem: the solve and its equations.
+        inputs: a pytree; its floating-point leaves may have tangents.
     """
     return _implicit(problem, inputs)
 
@@ -115,7 +122,7 @@ def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
 
 
 def _felt(problem: Problem, root: Array, inputs: Any, probed_along: Callable[[Array], Any]) -> Callable:
-    """Return ``probed_along`` as a product with its derivatives in the few directions that it feels."""
+    """Return ``probed_along`` as a product with the probe's derivatives along the columns of B."""
     forth = back = jnp.eye(len(root), dtype=root.dtype)
     if problem.directions is not None:
         forth, back = problem.directions(root, inputs)
@@ -128,10 +135,15 @@ def _felt(problem: Problem, root: Array, inputs: Any, probed_along: Callable[[Ar
 
 
 def with_derivative_of(value: _Value, function: Callable[..., _Value], *inputs: Any) -> _Value:
-    """Return ``value`` with the derivative of ``function(*inputs)``, which would compute the same.
+    """Return ``value`` with the derivative of ``function(*inputs)``, which would compute the same value.
 
-    For a result that is at hand already, as part of a larger one whose other parts need no derivative.
-    ``function`` must not close over arrays that are differentiated.
+    Use it for a result that is already known as a part of a larger computation whose other parts need no
+    derivative.
+
+    Args:
+        value: what ``function(*inputs)`` evaluates to.
+        function: must not close over arrays that are differentiated.
+        inputs: the arguments of ``function``; their floating-point leaves may have tangents.
     """
     return _known(value, function, inputs)
 
@@ -161,5 +173,5 @@ def _still(tree: Any) -> Any:
 
 
 def _tangent(tree: Any) -> Any:
-    """Return tangents with None in place of those of integers and booleans."""
+    """Return the tangents, with None in place of the tangents of integers and booleans."""
     return jax.tree.map(lambda leaf: leaf if eqx.is_inexact_array(leaf) else None, tree)

@@ -7,11 +7,17 @@ from jaxtyping import Array, Bool, Float, Int32
 
 _BLOCK = 32
 _ONE_PRODUCT = 64
-"""So few rows are summed by a single product."""
+"""Up to this many rows are summed by a single product."""
 
 
 def prefix_sum(values: Float[Array, "n *s"]) -> Float[Array, "n *s"]:
-    """Return the sum of the rows, of which there is at least one, up to each one, itself included."""
+    """Return the sum of the rows up to each row, that row included.
+
+    Blocks of rows are summed by a product with a triangular matrix, and the sums of the blocks recursively.
+
+    Args:
+        values: n rows, at least one.
+    """
     count, *shape = values.shape
     block = count if count <= _ONE_PRODUCT else _BLOCK
     padding = ((0, -count % block), *((0, 0) for _ in shape))
@@ -25,7 +31,7 @@ def prefix_sum(values: Float[Array, "n *s"]) -> Float[Array, "n *s"]:
 
 
 def running_count(mask: Bool[Array, " n"]) -> Int32[Array, " n"]:
-    """Return how many rows are true up to each one, itself included; exact below 2^24 rows."""
+    """Return how many rows are true up to each row, that row included; exact below 2^24 rows."""
     return prefix_sum(mask.astype(jnp.float32)).astype(jnp.int32)
 
 
@@ -34,7 +40,7 @@ def counts_before(
 ) -> tuple[Int32[Array, "rows columns"], Int32[Array, " columns"]]:
     """Return the sum of the rows before each row, and the sum of all rows.
 
-    A loop over the rows: on a CPU faster than the logarithmic sweeps ``jnp.cumsum`` compiles to.
+    This is a loop over the rows. On a CPU it is faster than the logarithmic sweeps of ``jnp.cumsum``.
     """
 
     def add(before: Array, row: Array) -> tuple[Array, Array]:

@@ -1,7 +1,7 @@
 """Device-side types: padded arrays with a mask, as equinox pytrees.
 
-Frames: ``T_a_b`` maps coordinates from b to a. Absolute time never reaches the device: all times here are
-seconds from the start of the scan; the host keeps int64 nanoseconds.
+Frames: ``T_a_b`` maps coordinates from b to a. Absolute time never reaches the device: all times here are in
+seconds from the start of the scan, and the host keeps int64 nanoseconds.
 """
 
 import equinox as eqx
@@ -17,19 +17,19 @@ class Scan(eqx.Module):
     """One LiDAR sweep, padded to a bucket size n."""
 
     points: Float[Array, "n 3"]
-    """Coordinates in the lidar frame at each point's own firing time, m."""
+    """Coordinates in the lidar frame at the firing time of each point, m."""
     time: Float[Array, " n"]
     """Firing time from the scan's start, s."""
     ring: Int32[Array, " n"]
-    """Beam index, 0 = first beam of the sensor's own numbering."""
+    """Beam index in the sensor's numbering, from 0."""
     intensity: Float[Array, " n"]
-    """Return strength as the sensor reports it (no unit)."""
+    """Intensity of the return as the sensor reports it, no unit."""
     mask: Bool[Array, " n"]
     """True where a point is real, False on padding."""
     duration: Float[Array, ""]
-    """Time from scan start to scan end, s; 0 for a sweep that is already motion compensated."""
+    """Time from the scan's start to its end, s; 0 for a sweep that is already motion compensated."""
     interval: Float[Array, ""]
-    """Time from the last scan's end to this scan's end, s; 0 for the first."""
+    """Time from the previous scan's end to this scan's end, s; 0 for the first scan."""
 
 
 class ImuBatch(eqx.Module):
@@ -40,35 +40,43 @@ class ImuBatch(eqx.Module):
     gyro: Float[Array, "m 3"]
     """Angular rate in the IMU frame, rad/s."""
     accel: Float[Array, "m 3"]
-    """Specific force in the IMU frame, m/s^2: +g upwards at rest."""
+    """Specific force in the IMU frame, m/s^2: at rest it points up, with magnitude g."""
     mask: Bool[Array, " m"]
-    """True where a sample is real."""
+    """True where a sample is real, False on padding."""
     orientation: Float[Array, "m 4"] | None = None
-    """What the IMU itself says of its attitude in world, xyzw; None where it says nothing or nobody asks."""
+    """The IMU's own estimate of its attitude in world, as quaternions xyzw; None where the IMU has none, or
+    where the recipe does not use it."""
 
 
 class NavState(eqx.Module):
-    """What the estimator knows about the vehicle at a scan's end.
+    """The estimated state of the vehicle at a scan's end.
 
     Its error state is that of :mod:`lio_jax.core.error_state`.
     """
 
     T_world_imu: jaxlie.SE3
+    """Pose of the IMU in world, m."""
     velocity: Float[Array, "3"]
-    """Of the IMU origin, in world, m/s."""
+    """Velocity of the IMU's origin, m/s, in world."""
     gyro_bias: Float[Array, "3"]
-    """rad/s, IMU frame."""
+    """Bias of the gyroscope, rad/s, IMU frame."""
     accel_bias: Float[Array, "3"]
-    """m/s^2, IMU frame."""
+    """Bias of the accelerometer, m/s^2, IMU frame."""
     gravity: Float[Array, "3"]
-    """In world, m/s^2; (0, 0, -g) once the world is levelled."""
+    """Acceleration of gravity, m/s^2, in world; (0, 0, -g) in a level world."""
     T_imu_lidar: jaxlie.SE3
+    """Extrinsic pose of the lidar in the IMU frame, m."""
     time_offset: Float[Array, ""]
     """Lag of the lidar's clock, s: a scan stamped t was taken at IMU time t + time_offset."""
 
 
 def initial_nav_state(T_imu_lidar: jaxlie.SE3, gravity_magnitude: float = 9.80665) -> NavState:
-    """Return the state of a vehicle at rest at the world's origin, with zero biases."""
+    """Return the state of a level vehicle at rest at the world's origin, with zero biases and time offset.
+
+    Args:
+        T_imu_lidar: extrinsic; its dtype is that of the state.
+        gravity_magnitude: m/s^2.
+    """
     dtype = T_imu_lidar.wxyz_xyz.dtype
     return NavState(
         T_world_imu=jaxlie.SE3(jnp.array([1, 0, 0, 0, 0, 0, 0], dtype)),
@@ -82,5 +90,5 @@ def initial_nav_state(T_imu_lidar: jaxlie.SE3, gravity_magnitude: float = 9.8066
 
 
 def state_dtype() -> jnp.dtype:
-    """Return the dtype of navigation states and covariances: float64 where JAX's x64 mode is on."""
+    """Return the dtype of navigation states and covariances: float64 in JAX's x64 mode, otherwise float32."""
     return jax.dtypes.canonicalize_dtype(jnp.float64)

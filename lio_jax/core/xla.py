@@ -1,4 +1,4 @@
-"""How programs are compiled by XLA, and how an intermediate result is kept from being computed twice."""
+"""What this library asks of XLA: fast compilation of its programs, and intermediate results computed once."""
 
 import gc
 import time
@@ -13,9 +13,12 @@ _Tree = TypeVar("_Tree")
 def computed_once(tree: _Tree) -> _Tree:
     """Return ``tree``, computed once and kept in memory.
 
-    XLA's CPU backend fuses a chain of elementwise operations and gathers into each of its uses and so repeats
-    it for every column of a result; it drops optimization barriers, but does not look through a conditional
-    whose condition it can't decide.
+    XLA's CPU backend fuses a chain of elementwise operations and gathers into each of its uses. So it repeats
+    the chain for every column of a result. It ignores optimization barriers, but it does not optimise across
+    a conditional whose condition is unknown at compile time.
+
+    Args:
+        tree: a pytree of arrays; its first leaf has at least one element.
     """
     first = jax.tree.leaves(tree)[0].ravel()[0].astype(jnp.float32)
     always = (first < 0) | (first >= 0) | (first != first)
@@ -25,12 +28,12 @@ def computed_once(tree: _Tree) -> _Tree:
 
 
 _CPU_OPTIONS: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False}
-"""XLA's newer emitters of kernels take twice as long, for a step that is no faster."""
+"""Options of the CPU backend: XLA's newer kernel emitters compile twice as long, for a step no faster."""
 
 
 def compiled(function: Any, *arguments: Any) -> jax.stages.Compiled:
-    """Return the program that a jitted function is for these arguments."""
-    # of all that tracing makes nothing is garbage, and looking through it takes a quarter of the time
+    """Compile a jitted function for the shapes and dtypes of these arguments, and return the program."""
+    # tracing makes many objects and no garbage: searching them would take a quarter of the time
     collecting = gc.isenabled()
     gc.disable()
     try:
@@ -43,28 +46,28 @@ def compiled(function: Any, *arguments: Any) -> jax.stages.Compiled:
     try:
         return lowered.compile(compiler_options=_CPU_OPTIONS)
     except jax.errors.JaxRuntimeError as error:
-        # an XLA that has only the newer ones
+        # a version of XLA that has only the newer emitters
         if "No such compile option" not in str(error):
             raise
         return lowered.compile()
 
 
 class PerShape:
-    """A jitted function, compiled by :func:`compiled` once for every shape of its arguments."""
+    """A jitted function that :func:`compiled` compiles once for each combination of shapes and dtypes."""
 
     def __init__(self, jitted: Any) -> None:
         """Keep the function; nothing is compiled yet."""
         self._jitted = jitted
         self._programs: dict[Any, Any] = {}
         self.compile_s = 0.0
-        """Time spent on tracing and compiling so far, s."""
+        """Total time spent on tracing and compiling, s."""
 
     def __len__(self) -> int:
-        """Return the number of programs compiled."""
+        """Return the number of programs compiled so far."""
         return len(self._programs)
 
     def __call__(self, *arguments: Any) -> Any:
-        """Run the program for these arguments."""
+        """Run the program for these arguments; compile it first where the shapes or dtypes are new."""
         key = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(arguments))
         if key not in self._programs:
             start = time.perf_counter()

@@ -1,4 +1,4 @@
-"""A chain of states with all that was measured along it, and its normal equations."""
+"""A chain of states with all measurements along it, and its normal equations."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -18,53 +18,66 @@ from lio_jax.imu.preintegration import Preintegrated
 
 
 class Chain(eqx.Module):
-    """Measurements in arrays of n rows, one a state; those of two states stand in the row of the first."""
+    """Measurements of n states, in n rows; a measurement between two states is in the row of the first."""
 
     count: Int32[Array, ""]
-    """States there are: those behind are padding, and so are the rows that lead to them."""
+    """Number of real states. Later rows are padding, and so are the links to them."""
     gravity: Float[Array, "3"]
-    """In world, m/s^2."""
+    """Acceleration of gravity, m/s^2, in world."""
     prior: Prior
-    """Of the first state."""
+    """Prior of the first state."""
     imu: Preintegrated
-    """To the next state; the last row leads nowhere. What has no samples has a wide covariance."""
+    """Preintegrated samples to the next state; the last row is not used. A link without samples has a large
+    covariance."""
     lidar: PoseMeasurement
+    """Pose of each state by scan matching."""
     relative: RelativePose | None = None
+    """Pose of the next state in the frame of each; None: there are no such measurements."""
     gps: PositionMeasurement | None = None
+    """Position of the antenna at each state; None: there are no such measurements."""
 
     def present(self) -> Bool[Array, " n"]:
-        """Return which rows are no padding."""
+        """Return the mask of real states."""
         return jnp.arange(self.imu.duration.shape[0]) < self.count
 
     def map_rows(self, change: Callable[..., Array], *others: "Chain") -> "Chain":
-        """Return the chain with all arrays of n rows changed; ``others`` are further arguments."""
+        """Return the chain with all arrays of n rows changed.
+
+        Args:
+            change: function of an array of n rows, and of the same array of each of ``others``.
+            others: chains of the same structure.
+        """
         fields = lambda chain: (chain.imu, chain.lidar, chain.relative, chain.gps)  # noqa: E731
         rows = jax.tree.map(change, fields(self), *map(fields, others))
         return Chain(self.count, self.gravity, self.prior, *rows)
 
 
 class Weights(NamedTuple):
-    """What the robust kernel lets through of each measurement, 0 to 1; 0 where there is none."""
+    """Weights of the measurements by the robust kernel, from 0 to 1; 0 where there is no measurement."""
 
     lidar: Float[Array, " n"]
+    """Weights of the poses by scan matching."""
     relative: Float[Array, " m"] | None
-    """Between neighbours, m = n - 1."""
+    """Weights of the relative poses between neighbours, m = n - 1."""
     gps: Float[Array, " n"] | None
+    """Weights of the antenna's positions."""
 
 
 class Normal(eqx.Module):
     """The cost of a chain's states to second order in their errors."""
 
     matrix: BlockTridiagonal
-    """Gauss-Newton's; the identity where there is no state."""
+    """Hessian of the cost, by Gauss-Newton unless exact; the identity for padding."""
     gradient: Float[Array, "n 15"]
+    """Gradient of the cost by each state's error."""
     cost: Float[Array, ""]
-    """Negative log-density but for a constant."""
+    """Negative log-density of states and measurements, without a constant."""
     weights: Weights
+    """Weights of the measurements at these states."""
 
 
 def information_of(chain: Chain) -> Float[Array, "m 15 15"]:
-    """Return the information of each link: once per solve, because it doesn't depend on the states."""
+    """Return the information of each inertial link, which does not depend on the states."""
     return jax.vmap(imu_information)(chain.imu.covariance[:-1])[0]
 
 
@@ -75,10 +88,10 @@ def linearise(
 
     Args:
         chain: n rows, at least two.
-        information: of its links, from :func:`information_of`.
-        states: n rows, where to linearise.
-        exact: with the second derivatives of the residuals, as the derivative of a solution needs them. The
-            matrix is then that of the gradient's derivative, which is symmetric where the gradient vanishes.
+        information: information of the links, from :func:`information_of`.
+        states: n states at which to linearise.
+        exact: include the second derivatives of the residuals, which the derivative of a solution needs. The
+            matrix is then the derivative of the gradient, which is symmetric where the gradient vanishes.
     """
     present = chain.present()
     start = jax.tree.map(lambda rows: rows[:-1], states)

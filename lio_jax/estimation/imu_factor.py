@@ -14,15 +14,16 @@ from lio_jax.estimation.quadratic import Quadratic, quadratic
 from lio_jax.imu.preintegration import Preintegrated, predict
 
 FLOOR = (1e-6,) * 9 + (1e-8,) * 3 + (1e-7,) * 3
-"""Sigmas added to the preintegrated covariance, rad, m, m/s, rad/s, m/s^2: between two states of one instant,
-or one sample apart, it is singular. Small against any sensor's noise, large against float64's rounding."""
+"""Standard deviations added to the preintegrated covariance, rad, m, m/s, rad/s, m/s^2. Without them the
+covariance between two states at one instant, or one sample apart, is singular. They are small against any
+sensor's noise and large against float64's rounding."""
 
 
 def imu_information(covariance: Float[Array, "15 15"]) -> tuple[Float[Array, "15 15"], Float[Array, ""]]:
-    """Return the inverse of a preintegrated covariance, and the inverse's log-determinant."""
+    """Return the inverse of a preintegrated covariance plus ``FLOOR``, and the inverse's log-determinant."""
     dtype = covariance.dtype
     floored = covariance + jnp.diag(jnp.asarray(FLOOR, dtype) ** 2)
-    # scaled to unit variances: the units' sizes differ by orders of magnitude
+    # scaled to unit variances, because the variances differ by many orders of magnitude
     scale = 1 / jnp.sqrt(jnp.diagonal(floored))
     lower = jnp.linalg.cholesky(scale[:, None] * floored * scale)
     identity = jnp.eye(len(scale), dtype=dtype)
@@ -31,7 +32,13 @@ def imu_information(covariance: Float[Array, "15 15"]) -> tuple[Float[Array, "15
 
 
 def predicted(measured: Preintegrated, gravity: Float[Array, "3"], start: MotionState) -> MotionState:
-    """Return the end of a motion from its start; the biases stay."""
+    """Return the state at the end of a preintegrated motion; the biases do not change.
+
+    Args:
+        measured: preintegrated from ``start``.
+        gravity: m/s^2, in world.
+        start: state at the first instant.
+    """
     still = jaxlie.SE3(jnp.array([1, 0, 0, 0, 0, 0, 0], gravity.dtype))
     nav = NavState(
         T_world_imu=start.T_world_imu,
@@ -52,7 +59,15 @@ def imu_quadratic(
     start: MotionState,
     end: MotionState,
 ) -> Quadratic:
-    """Return the cost of the motion from ``start`` to ``end``, over both states' errors."""
+    """Return the cost of the motion from ``start`` to ``end`` as a function of both states' errors.
+
+    Args:
+        measured: preintegrated from ``start`` to ``end``.
+        gravity: m/s^2, in world.
+        information: from :func:`imu_information`.
+        start: state at the first instant.
+        end: state at the last instant.
+    """
     residual, jacobian = imu_residual(measured, gravity, start, end)
     return quadratic(residual, jacobian, information, jnp.ones((), residual.dtype))
 
@@ -60,17 +75,17 @@ def imu_quadratic(
 def imu_residual(
     measured: Preintegrated, gravity: Float[Array, "3"], start: MotionState, end: MotionState
 ) -> tuple[Float[Array, "15"], Float[Array, "15 30"]]:
-    """Return the predicted end against ``end``, and how that depends on the errors of both states.
+    """Return the difference between the predicted end and ``end``, and its Jacobian by both states' errors.
 
-    ``end.local(predicted)`` of rotation, position and velocity, as gtsam's ImuFactor has it, and the biases
-    at the start minus those at the end (Forster et al. 2017, eqs. 45 and 40; their right Jacobians, appendix
-    C, with all residuals in the end's frame). The biases change the increments to first order.
+    The residual is ``end.local(predicted)`` for rotation, position and velocity, as in gtsam's ImuFactor, and
+    the biases at the start minus those at the end (Forster et al. 2017, eqs. 45 and 40; right Jacobians from
+    appendix C, with all residuals in the end's frame). The biases change the increments to first order.
 
     Args:
-        measured: preintegrated from ``start`` to ``end``. Without samples it says that the velocity stays.
-        gravity: in world, m/s^2.
+        measured: preintegrated from ``start`` to ``end``. Without samples the velocity is constant.
+        gravity: m/s^2, in world.
         start: state at the first instant.
-        end: state at the last one.
+        end: state at the last instant.
     """
     biases = jnp.concatenate([start.gyro_bias, start.accel_bias])
     by_bias = measured.bias_jacobian
@@ -86,7 +101,7 @@ def imu_residual(
     R_end_before = R_end_start @ R_start_before
     (bias_turn, _), (_, right) = zip(*right_jacobian(jnp.stack([gained[ROTATION], turn])), strict=True)
 
-    # position and velocity side by side
+    # position and velocity stacked
     way = first.translation() + elapsed * (start.velocity + elapsed / 2 * fall) - last.translation()
     speed = start.velocity + elapsed * fall - end.velocity
     increments = jnp.stack([measured.position, measured.velocity])
@@ -99,7 +114,7 @@ def imu_residual(
     by_gained = jnp.stack([right @ bias_turn, R_end_before, R_end_before])
     by_start_turn = jnp.stack([right @ R_start_predicted.T, *(-R_end_start @ skew(increments))])
     by_end_turn = jnp.stack([-right.T, *skew(missed)])
-    # position by position and velocity, velocity by velocity
+    # derivatives of position by position and velocity, and of velocity by velocity
     shares = jnp.stack([jnp.ones_like(elapsed), elapsed, jnp.zeros_like(elapsed), jnp.ones_like(elapsed)])
     by_start = shares.reshape(2, 1, 2, 1) * R_end_start[None, :, None]
     motion = jnp.concatenate(

@@ -1,8 +1,8 @@
-"""Innovation statistics at the cost of k x k algebra, however many residuals went into the measurement.
+"""Innovation statistics by k x k algebra, at a cost that does not depend on the number of residuals.
 
-With the measurement's information A = C C' and a prior covariance W of the k-dimensional quantity that it
-measures, everything follows from the k x k matrix I + C'WC: the covariance of the innovation in units of
-the measurement's own noise.
+Let A = C C' be the measurement's information on a k-dimensional quantity with prior covariance W. All
+statistics follow from the k x k matrix I + C'WC, the covariance of the innovation in units of the
+measurement's own noise.
 """
 
 import equinox as eqx
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int32
 
 
 class Innovation(eqx.Module):
-    """What a measurement says against the prediction, in the directions that it observes."""
+    """The innovation of a measurement in the directions that it observes."""
 
     whitened: Float[Array, " k"]
     """Innovation along the principal directions in units of the measurement's noise; zero if unobserved."""
@@ -21,20 +21,20 @@ class Innovation(eqx.Module):
     nis: Float[Array, ""]
     """Normalised innovation squared: chi-square of ``dof`` degrees of freedom for a consistent filter."""
     dof: Int32[Array, ""]
-    """Directions observed: the rank of the measurement's information."""
+    """Number of observed directions: the rank of the measurement's information."""
     log_det: Float[Array, ""]
-    """Log-determinant of the innovation's covariance where observed, in the quantity's units."""
+    """Log-determinant of the innovation's covariance in the observed directions, in the quantity's units."""
 
     def log_likelihood(self) -> Float[Array, ""]:
-        """Return the log-density of the innovation, the measurement seen as one of ``dof`` dimensions."""
+        """Return the log-density of the innovation, for a measurement of ``dof`` dimensions."""
         return -0.5 * (self.nis + self.log_det + self.dof * jnp.log(2 * jnp.pi))
 
     def solve(self, right: Float[Array, "k n"]) -> Float[Array, "k n"]:
         """Return the inverse covariance of ``whitened`` times ``right``.
 
-        By the inverse factor, which is harmless here: the covariance is the identity and more. Solving for
-        the many columns of a batch of tangents would be handed to the linear algebra library's threads, which
-        take longer to wake than the solve does.
+        The factor is inverted, which is accurate here, because the covariance is at least the identity. A
+        solve for the many columns of a batch of tangents would use the linear algebra library's threads, and
+        waking them takes longer than the solve.
         """
         k = self.factor.shape[0]
         inverse = jax.scipy.linalg.solve_triangular(self.factor, jnp.eye(k, dtype=right.dtype), lower=True)
@@ -46,8 +46,12 @@ def square_root_information(
 ) -> tuple[Float[Array, "k k"], Float[Array, " k"], Float[Array, " k"]]:
     """Return C with C C' = information, u with C u = gradient, and the eigenvalues, zero where unobserved.
 
-    Eigenvalues below the rounding error of the largest one, and negative ones, count as zero, and the
-    gradient's part along their directions is dropped.
+    Eigenvalues below the rounding error of the largest one, and negative ones, count as zero. The gradient's
+    part along their directions is dropped.
+
+    Args:
+        information: symmetric matrix.
+        gradient: gradient of half the squared error in the same coordinates.
     """
     root, residual, values, _ = _square_root(information, gradient)
     return root, residual, values
@@ -67,11 +71,11 @@ def _square_root(information: Array, gradient: Array) -> tuple[Array, Array, Arr
 
 @_square_root.defjvp
 def _square_root_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
-    """Differentiate the root up to a turn C -> CQ, which no statistic of the innovation can see.
+    """Differentiate the root up to a rotation C -> CQ, on which no statistic of the innovation depends.
 
-    The eigenvectors' own derivative, infinite where eigenvalues meet, is not needed: with the pseudoinverse
-    C+ and the projector N on what is not observed, dC = (CC+/2 + N) dA C+' satisfies dA = dC C' + C dC'
-    for every dA that keeps the rank.
+    The derivative of the eigenvectors, which is infinite for equal eigenvalues, is not needed. With the
+    pseudoinverse C+ and the projector N on the unobserved directions, dC = (CC+/2 + N) dA C+' satisfies
+    dA = dC C' + C dC' for every dA that keeps the rank.
     """
     values = _square_root(*primals)
     _, residual, eigenvalues, vectors = values
@@ -129,9 +133,9 @@ def innovation_log_likelihood(
         squared_error: r' R^-1 r of the residuals at the prior mean.
         log_det_noise: log|R|.
         count: number m of residuals.
-        information: H' R^-1 H, H the derivative of the residuals with respect to the measured quantity.
+        information: H' R^-1 H, where H is the derivative of the residuals by the measured quantity.
         gradient: H' R^-1 r.
-        covariance: W, the prior's of the measured quantity: J P J'.
+        covariance: prior covariance W = J P J' of the measured quantity.
     """
     root, along, values = square_root_information(information, gradient)
     spread = covariance @ root

@@ -1,14 +1,15 @@
-"""How far the local map has drifted from the world of the first scan.
+"""The drift of the local map from the world of the first scan.
 
-A scan match tells the pose within the map around the vehicle, not within the world: what is new in a scan is
-added where the vehicle is taken to be, and later scans are matched with it. So a part of each pose's error
-stays in the map and is never seen in an innovation. A filter that takes its map for true reports the first
-error alone; the trajectory's error is the sum of both.
+A scan match observes the pose within the map around the vehicle, and not the pose in the world. The new
+points of a scan are added to the map at the estimated pose, and later scans are matched with them. So a part
+of each pose's error stays in the map, and no innovation contains it. A filter that takes its map as exact
+reports the error within the map only; the error of the trajectory is the sum of both.
 
-With f the share of a scan that is new to the map, the map ahead is wrong by m' = (1 - f) m + f (m + e) =
-m + f e, e the pose's error within the map: a random walk with variance f^2 P a scan, carried along as the
-vehicle moves. It takes the errors e of successive scans as independent, as they are where the match tells
-much more than the prediction. A map of one scan alone is as wrong as the match of another scan with it.
+Let f be the share of a scan that is new to the map, and e the pose's error within the map. The error m of the
+map ahead becomes m' = (1 - f) m + f (m + e) = m + f e. This is a random walk with variance f^2 P per scan.
+The errors e of successive scans are taken as independent, which holds where the match has much more
+information than the prediction. The error of a map of a single scan is that of the match of another scan with
+it.
 """
 
 import equinox as eqx
@@ -27,16 +28,21 @@ class MapDrift(eqx.Module):
     """The error of the map around the vehicle."""
 
     covariance: Float[Array, "6 6"]
-    """Of the IMU's pose in the world if it were exact within the map; right perturbation, rotation (rad)
-    before translation (m)."""
+    """Covariance of the IMU's pose in world that the map's error causes alone: right perturbation, rotation
+    (rad) before translation (m)."""
 
     @staticmethod
     def none(dtype: jnp.dtype) -> "MapDrift":
-        """Return the drift of a map that its first scan defines."""
+        """Return zero drift, that of the first scan's map."""
         return MapDrift(jnp.zeros((6, 6), dtype))
 
     def carried(self, T_world_before: jaxlie.SE3, T_world_imu: jaxlie.SE3) -> "MapDrift":
-        """Return the drift as seen from another pose in the same map."""
+        """Return the drift with the covariance at another pose in the same map.
+
+        Args:
+            T_world_before: the pose to which the drift refers now.
+            T_world_imu: the pose to which the result refers.
+        """
         between = T_world_imu.inverse() @ T_world_before
         R = rotation_matrix(between.rotation())
         adjoint = from_blocks(
@@ -54,18 +60,22 @@ class MapDrift(eqx.Module):
         """Return the drift after a scan was added.
 
         Args:
-            covariance: of the error within the map of the state that the scan was added at.
-            share: of the scan's points that were new to the map.
-            scans: how many had been seen before: the first one is the world, and the second tells how well it
-                shows it.
+            covariance: covariance, within the map, of the state at which the scan was added.
+            share: share of the scan's points that were new to the map, 0 to 1.
+            scans: number of earlier scans. The first scan defines the world, so its share counts as 0. The
+                match of the second shows the error of the first scan's map, so its share counts as 1.
         """
         share = jnp.select([scans == 0, scans == 1], [0.0, 1.0], share.astype(covariance.dtype))
         return MapDrift(self.covariance + share**2 * covariance[_POSE, _POSE])
 
     def added_to(self, covariance: Float[Array, "24 24"], nav: NavState) -> Float[Array, "24 24"]:
-        """Return the covariance in the world of a state's error, given that within the map.
+        """Return the covariance of a state's error in the world, given its covariance within the map.
 
-        A turned map turns the velocity with the pose.
+        A rotation of the map rotates the velocity as well as the pose.
+
+        Args:
+            covariance: covariance within the map, in the order of :mod:`lio_jax.core.error_state`.
+            nav: the state.
         """
         R_imu_world = rotation_matrix(nav.T_world_imu.rotation()).T
         dtype = covariance.dtype

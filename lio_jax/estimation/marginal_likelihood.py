@@ -1,4 +1,4 @@
-"""How probable a chain's measurements are, whatever the states: the marginal likelihood."""
+"""The marginal likelihood of a chain's measurements: their density with all states integrated out."""
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +16,15 @@ from lio_jax.estimation.smoother import Smoothed
 def log_evidence(chain: Chain, smoothed: Smoothed) -> Float[Array, ""]:
     """Return the log marginal likelihood of all measurements, by Laplace's approximation.
 
-    ``log p(z) = log p(z, x) + DOF n / 2 log(2 pi) - log|H| / 2`` at the most probable states x, with
-    Gauss-Newton's H (MacKay, "Information theory, inference, and learning algorithms", 2003, chapter 27);
-    exact for a linear Gaussian model. A robust kernel changes cost and Hessian, but not what a measurement's
-    density is divided by: outliers neither vanish for nothing nor decide. Its derivative is that of the
-    solution and of the log-determinant, without an iteration in it.
+    ``log p(z) = log p(z, x) + DOF n / 2 log(2 pi) - log|H| / 2`` at the most probable states x, with the
+    Gauss-Newton Hessian H (MacKay, "Information theory, inference, and learning algorithms", 2003, chapter
+    27). It is exact for a linear Gaussian model. A robust kernel changes the cost and the Hessian, but not
+    the normalisation of a measurement's density: an outlier keeps a cost, but does not dominate. The
+    derivative is that of the solution and of the log-determinant; no iteration is differentiated.
+
+    Args:
+        chain: the measurements.
+        smoothed: the most probable states of the chain.
     """
     matrix = smoothed.normal.matrix
     volume = DOF * chain.count / 2 * LOG_2PI - log_determinant(matrix) / 2
@@ -28,7 +32,7 @@ def log_evidence(chain: Chain, smoothed: Smoothed) -> Float[Array, ""]:
 
 
 def log_scale(chain: Chain) -> Float[Array, ""]:
-    """Return the log-density of all measurements and the prior where every residual is zero."""
+    """Return the log-density of all measurements and of the prior if every residual were zero."""
     present = chain.present()
     linked = jnp.concatenate([present[1:], jnp.zeros(1, bool)])
     of_links = jax.vmap(imu_information)(chain.imu.covariance)[1]
@@ -47,7 +51,7 @@ def _sum(twice: Float[Array, " n"], there: Array) -> Float[Array, ""]:
 
 
 def _of_information(information: Float[Array, "n d d"]) -> Float[Array, " n"]:
-    """Return log|A| - d log(2 pi) over those directions of each matrix that hold information."""
+    """Return log|A| - d log(2 pi) over the d directions of each matrix that have information."""
     nothing = jnp.zeros(information.shape[:-1], information.dtype)
     values = jax.vmap(square_root_information)(information, nothing)[2]
     there = values > 0

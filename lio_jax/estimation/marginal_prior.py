@@ -1,4 +1,4 @@
-"""What is known about a chain's first state without the chain: a given prior, or a marginalised past."""
+"""The prior of a chain's first state: a given Gaussian, or the marginal of earlier states."""
 
 import equinox as eqx
 import jax
@@ -15,13 +15,17 @@ class Prior(eqx.Module):
     """A log-density of a state's error e from an origin: log_scale - e' information e / 2 - gradient' e."""
 
     origin: MotionState
+    """The state to which the error refers."""
     information: Float[Array, "15 15"]
+    """Information on the error."""
     gradient: Float[Array, "15"]
+    """Gradient of the negative log-density at the origin."""
     log_scale: Float[Array, ""]
-    """After marginalisation it holds the log-likelihood of all that the forgotten states explained."""
+    """Log-density at the origin. After marginalisation it includes the log-likelihood of the measurements of
+    the states that were marginalised."""
 
     def quadratic(self, state: MotionState) -> Quadratic:
-        """Return the cost of a state, without ``log_scale``."""
+        """Return the cost as a function of a state's error, without ``log_scale``."""
         error = self.origin.local(state)
         jacobian = local_jacobian(self.origin, state)
         slope = self.information @ error
@@ -37,10 +41,10 @@ def gaussian_prior(mean: MotionState, covariance: Float[Array, "15 15"]) -> Prio
     """Return the prior of a state with a Gaussian error.
 
     Args:
-        mean: of the state.
-        covariance: of its error, positive definite.
+        mean: mean of the state.
+        covariance: covariance of the state's error, positive definite.
     """
-    # scaled to unit variances: a velocity's may be 1e14 times as large as a bias's
+    # scaled to unit variances: the variance of a velocity may be 1e14 times that of a bias
     scale = 1 / jnp.sqrt(jnp.diagonal(covariance))
     lower = jnp.linalg.cholesky(scale[:, None] * covariance * scale)
     root = jax.scipy.linalg.solve_triangular(lower, jnp.diag(scale), lower=True)
@@ -49,15 +53,15 @@ def gaussian_prior(mean: MotionState, covariance: Float[Array, "15 15"]) -> Prio
 
 
 def marginalised(joint: Quadratic, log_scale: Float[Array, ""], following: MotionState) -> Prior:
-    """Return what a quadratic density of two states says about the second one alone.
+    """Return the marginal density of the second of two states with a joint quadratic density.
 
-    Schur complement of the first state's block (Sibley et al., "Sliding window filter with application to
-    planetary landing", JFR 2010).
+    It follows from the Schur complement of the first state's block (Sibley et al., "Sliding window filter
+    with application to planetary landing", JFR 2010).
 
     Args:
-        joint: over the errors of the first and the second state, 30.
-        log_scale: of the density.
-        following: the second state, where ``joint`` was linearised.
+        joint: cost over the 30 entries of the errors of the first and the second state.
+        log_scale: log-density where the cost is zero.
+        following: the second state, at which ``joint`` was linearised.
     """
     own, across, kept = joint.hessian[:DOF, :DOF], joint.hessian[:DOF, DOF:], joint.hessian[DOF:, DOF:]
     lower = jnp.linalg.cholesky((own + own.T) / 2)

@@ -1,4 +1,4 @@
-"""The states of a chain: pose, velocity and biases, without what is common to all of them."""
+"""The states of a chain: pose, velocity and biases."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,20 +11,22 @@ from lio_jax.core.types import NavState
 from lio_jax.estimation.pose_logarithm import right_jacobian
 
 DOF = 15
-"""The first components of :mod:`lio_jax.core.error_state`, in that order and perturbed as there."""
+"""Size of the error: the first entries of :mod:`lio_jax.core.error_state`, in that order."""
 POSE_DOF = 6
+"""Size of the pose's error: rotation (rad) before translation (m)."""
 
 
 class MotionState(eqx.Module):
-    """Where the IMU is, how it moves and what its biases are; in batches one row a state."""
+    """Pose, velocity and biases of the IMU; batches have one row for each state."""
 
     T_world_imu: jaxlie.SE3
+    """Pose of the IMU in world, m."""
     velocity: Float[Array, "*b 3"]
-    """Of the IMU origin, in world, m/s."""
+    """Velocity of the IMU's origin, m/s, in world."""
     gyro_bias: Float[Array, "*b 3"]
-    """rad/s, IMU frame."""
+    """Bias of the gyroscope, rad/s, IMU frame."""
     accel_bias: Float[Array, "*b 3"]
-    """m/s^2, IMU frame."""
+    """Bias of the accelerometer, m/s^2, IMU frame."""
 
     @staticmethod
     def of(nav: NavState) -> "MotionState":
@@ -45,7 +47,7 @@ class MotionState(eqx.Module):
         )
 
     def local(self, other: "MotionState") -> Float[Array, "*b 15"]:
-        """Return the error with ``self.retract(error) == other``."""
+        """Return the error for which ``self.retract(error) == other``."""
         back = jnp.swapaxes(rotation_matrix(self.T_world_imu.rotation()), -1, -2)
         turn = self.T_world_imu.rotation().inverse() @ other.T_world_imu.rotation()
         return jnp.concatenate(

@@ -1,4 +1,4 @@
-"""The iterated update of the navigation state."""
+"""The iterated update of the navigation state by a measurement of a sweep's mean pose."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -31,11 +31,12 @@ from lio_jax.imu.rotation_integrals import rotation_exponential, rotation_integr
 
 
 class _State(NamedTuple):
-    """A prediction and the error that it is found to have: all iterates live in one tangent space."""
+    """A prediction and its estimated error; all iterates are in the tangent space of the prediction."""
 
     predicted: NavState
+    """The predicted state."""
     error: Float[Array, "30"]
-    """As in :class:`SweptState`."""
+    """Error of the prediction, with the entries of :class:`SweptState`'s covariance."""
 
     def end(self) -> NavState:
         """Return the state at the sweep's end."""
@@ -55,11 +56,11 @@ class _State(NamedTuple):
         return _State(self.predicted, self.error + error)
 
     def subtract(self, other: "_State") -> Float[Array, "30"]:
-        """Return the error by which the other differs."""
+        """Return the error of the other state less that of this one."""
         return other.error - self.error
 
     def reset(self, error: Float[Array, "30"]) -> Float[Array, "30 30"]:
-        """Return the change of tangent space by the error: none."""
+        """Return the Jacobian of a change of the tangent space: the identity, because it does not change."""
         return jnp.eye(error.shape[0], dtype=error.dtype)
 
     def _mean_error(self) -> Float[Array, "24"]:
@@ -77,7 +78,14 @@ class _AtMean(eqx.Module):
 
 
 def predicted_pose_covariance(prior: SweptState) -> Float[Array, "6 6"]:
-    """Return the covariance of the mean lidar pose over a sweep, perturbed as in the update."""
+    """Return the covariance of the predicted mean lidar pose over a sweep.
+
+    Args:
+        prior: predicted state.
+
+    Returns:
+        Covariance of the perturbation of :func:`~lio_jax.estimation.pose_measurement.lidar_pose_jacobian`.
+    """
     jacobian = _unchanged(prior).jacobian()
     return jacobian @ prior.covariance @ jacobian.T
 
@@ -92,20 +100,21 @@ def update_nav(
     first_aux: Any = None,
     again: Callable[..., Measurement] | None = None,
 ) -> tuple[Update, NavState]:
-    """Return the iterated update of a navigation state, and the state with the pose the measurement saw.
+    """Return the iterated update of a navigation state, and the state with the sweep's mean pose.
 
-    A sweep that was put together along the predicted motion is matched as a rigid body, so it measures the
-    mean of the pose's error over its points. The error at the sweep's end follows from their correlation.
+    A sweep that was deskewed along the predicted motion is matched as a rigid body, so it measures the mean
+    of the pose's error over its points. The error at the sweep's end follows from its correlation with the
+    mean.
 
     Args:
         prior: predicted state.
-        measure: linearises the measurement at the :class:`NavState` it is given, whose pose is the sweep's
-            mean, with respect to the lidar's pose, perturbed as in :func:`lidar_pose_jacobian`; see
-            :func:`iterated_update`.
-        max_iterations: bound of the loop, at least 1.
-        rotation_tolerance: converged when no component of a step turns more than this, rad ...
-        translation_tolerance: ... and none moves more than this, m.
-        first_aux: see :func:`iterated_update`; ``again`` likewise.
+        measure: linearises the measurement at a :class:`NavState` with the sweep's mean pose, by the lidar's
+            pose with the perturbation of :func:`lidar_pose_jacobian`; see :func:`iterated_update`.
+        max_iterations: largest number of iterations, at least 1.
+        rotation_tolerance: largest rotation of a converged step, rad, per component.
+        translation_tolerance: largest translation of a converged step, m, per component.
+        first_aux: see :func:`iterated_update`.
+        again: see :func:`iterated_update`.
 
     Returns:
         The update, with an :class:`NavEstimate` of the sweep's end as its ``state``, and the state with the
@@ -141,9 +150,13 @@ def _unchanged(prior: SweptState) -> _State:
 def reset_jacobian(nav: NavState, error: Float[Array, "24"]) -> Float[Array, "24 24"]:
     """Return the derivative of ``local(retract(nav, error), retract(nav, error + w))`` at w = 0.
 
-    It moves the covariance of an error from the tangent space at ``nav`` to that at ``retract(nav, error)``:
-    right Jacobians for the rotations, the rotation back for position and velocity, and on the gravity sphere
-    the left Jacobian between the two bases.
+    It maps the covariance of an error from the tangent space at ``nav`` to that at ``retract(nav, error)``.
+    Its blocks are right Jacobians for the rotations, the inverse rotation for position and velocity, and on
+    the gravity sphere the left Jacobian between the two bases.
+
+    Args:
+        nav: state at the origin of the first tangent space.
+        error: from ``nav`` to the origin of the second tangent space.
     """
     basis = sphere_basis(nav.gravity)
     turns = jnp.stack([-error[ROTATION], -error[EXTRINSIC_ROTATION], basis @ error[GRAVITY]])

@@ -1,7 +1,7 @@
-"""Measurements of poses and positions: by scan matching, between neighbours, by satellites.
+"""Measurements of poses and positions: by scan matching, between neighbouring states, and by satellites.
 
-Rows that are masked must be finite; their values don't matter. A pose's perturbation is a right one, rotation
-(rad) before translation (m).
+Masked rows must be finite; their values have no effect. The perturbation of a pose is a right perturbation,
+rotation (rad) before translation (m).
 """
 
 import equinox as eqx
@@ -16,33 +16,37 @@ from lio_jax.estimation.quadratic import Quadratic, robust_quadratic
 
 
 class PoseMeasurement(eqx.Module):
-    """The pose of a state, such as a scan match tells it."""
+    """A measured pose of a state, for example by a scan match."""
 
     T_world_imu: jaxlie.SE3
+    """Measured pose of the IMU in world, m."""
     information: Float[Array, "*b 6 6"]
     """Inverse covariance of its right perturbation; directions without information are allowed."""
     kernel: Float[Array, "*b"]
-    """Of :func:`robust_quadratic`, sigmas."""
+    """Kernel width of :func:`robust_quadratic`, standard deviations."""
     mask: Bool[Array, "*b"]
-    """False where there is none."""
+    """False where there is no measurement."""
 
     def quadratic(self, state: MotionState) -> Quadratic:
-        """Return the cost over the pose's error of one measurement: log(measured^-1 T_world_imu)."""
+        """Return the cost of one measurement by the pose's error; the residual is log(measured^-1 T)."""
         residual, jacobian = log_and_jacobian(self.T_world_imu.inverse() @ state.T_world_imu)
         return robust_quadratic(residual, jacobian, self.information, self.kernel, self.mask)
 
 
 class RelativePose(eqx.Module):
-    """The pose of the next state in the frame of this one, such as scan-to-scan odometry tells it."""
+    """A measured pose of the next state in the frame of this one, for example by scan-to-scan odometry."""
 
     T_imu_next: jaxlie.SE3
+    """Measured pose of the next IMU frame in this one, m."""
     information: Float[Array, "*b 6 6"]
-    """As that of :class:`PoseMeasurement`."""
+    """Inverse covariance of its right perturbation; directions without information are allowed."""
     kernel: Float[Array, "*b"]
+    """Kernel width of :func:`robust_quadratic`, standard deviations."""
     mask: Bool[Array, "*b"]
+    """False where there is no measurement."""
 
     def quadratic(self, state: MotionState, following: MotionState) -> Quadratic:
-        """Return the cost over both poses' errors of one measurement: log(measured^-1 T_imu_next)."""
+        """Return the cost of one measurement by both poses' errors; the residual is log(measured^-1 T)."""
         between = state.T_world_imu.inverse() @ following.T_world_imu
         residual, by_next = log_and_jacobian(self.T_imu_next.inverse() @ between)
         jacobian = jnp.concatenate([-by_next @ adjoint(between.inverse()), by_next], axis=1)
@@ -50,19 +54,21 @@ class RelativePose(eqx.Module):
 
 
 class PositionMeasurement(eqx.Module):
-    """The position of an antenna, in world."""
+    """A measured position of an antenna."""
 
     position: Float[Array, "*b 3"]
-    """m."""
+    """Measured position, m, in world."""
     sigma: Float[Array, "*b 3"]
-    """Per axis of the world, m."""
+    """Standard deviation along each axis of the world, m."""
     lever_arm: Float[Array, "*b 3"]
-    """Of the antenna in the IMU frame, m."""
+    """Position of the antenna, m, IMU frame."""
     kernel: Float[Array, "*b"]
+    """Kernel width of :func:`robust_quadratic`, standard deviations."""
     mask: Bool[Array, "*b"]
+    """False where there is no measurement."""
 
     def quadratic(self, state: MotionState) -> Quadratic:
-        """Return the cost over the pose's error of one measurement."""
+        """Return the cost of one measurement by the pose's error."""
         matrix = rotation_matrix(state.T_world_imu.rotation())
         antenna = state.T_world_imu.translation() + matrix @ self.lever_arm
         jacobian = jnp.concatenate([-matrix @ skew(self.lever_arm), matrix], axis=1)
@@ -74,9 +80,14 @@ class PositionMeasurement(eqx.Module):
 def fixed_information(
     rotation_sigma: Float[Array, "*b"], translation_sigma: Float[Array, "*b"]
 ) -> Float[Array, "*b 6 6"]:
-    """Return the information of a pose with one sigma for its rotation, rad, and one for its position, m.
+    """Return the information of a pose with one standard deviation for rotation and one for position.
 
-    LIO-SAM weighs every scan match alike: 0.05 rad and 0.1 m, or 1 and 1 where it was degenerate.
+    LIO-SAM gives every scan match the same information: 0.05 rad and 0.1 m, or 1 rad and 1 m for a degenerate
+    match.
+
+    Args:
+        rotation_sigma: rad, per axis.
+        translation_sigma: m, per axis.
     """
     sigmas = jnp.repeat(jnp.stack([rotation_sigma, translation_sigma], axis=-1), 3, axis=-1)
     return sigmas[..., None] ** -2 * jnp.eye(POSE_DOF, dtype=sigmas.dtype)

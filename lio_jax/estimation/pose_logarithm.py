@@ -1,6 +1,7 @@
 """The logarithm of a pose and its derivative, in closed form and smooth at zero.
 
-Order: rotation (rad), translation (m). See Barfoot, "State estimation for robotics", 2017, section 7.1.
+Tangents are in the order rotation (rad), translation (m). Source: Barfoot, "State estimation for robotics",
+2017, section 7.1.
 """
 
 import jax.numpy as jnp
@@ -12,9 +13,9 @@ from lio_jax.imu.rotation_integrals import rotation_coefficients
 
 
 def right_jacobian(rotvec: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3 3"], Float[Array, "*b 3 3"]]:
-    """Return J with Exp(w + dw) = Exp(w) Exp(J dw) at a rotation vector w, rad, and its inverse.
+    """Return J with Exp(w + dw) = Exp(w) Exp(J dw) at a rotation vector w, rad, and the inverse of J.
 
-    The inverse is the derivative of log(R Exp(d)) at d = 0.
+    The inverse is the derivative of log(R Exp(d)) at d = 0 for R = Exp(w).
     """
     cross = skew(rotvec)
     square = cross @ cross
@@ -26,8 +27,9 @@ def right_jacobian(rotvec: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3 3"]
 def log_and_jacobian(pose: jaxlie.SE3) -> tuple[Float[Array, "*b 6"], Float[Array, "*b 6 6"]]:
     """Return log(T), and the derivative of log(T exp(d)) at d = 0.
 
-    The translation's part is the inverse left Jacobian J(w)^-1 = I - W/2 + k W^2 times t, with W the cross
-    product with the rotation vector w, so its derivative follows from that of k by the angle's square.
+    The translation's part of log(T) is J(w)^-1 t with the inverse left Jacobian J(w)^-1 = I - W/2 + k W^2,
+    where W is the matrix of the cross product with the rotation vector w. So its derivative follows from that
+    of k by the square of the angle.
     """
     turn, along = pose.rotation().log(), pose.translation()
     turning, moving = jnp.moveaxis(skew(jnp.stack([turn, along], axis=-2)), -3, 0)
@@ -52,7 +54,7 @@ def log_and_jacobian(pose: jaxlie.SE3) -> tuple[Float[Array, "*b 6"], Float[Arra
 
 
 def adjoint(pose: jaxlie.SE3) -> Float[Array, "6 6"]:
-    """Return Ad with T exp(d) = exp(Ad d) T."""
+    """Return the adjoint Ad for which T exp(d) = exp(Ad d) T."""
     matrix = rotation_matrix(pose.rotation())
     return jnp.block([[matrix, jnp.zeros_like(matrix)], [skew(pose.translation()) @ matrix, matrix]])
 

@@ -18,10 +18,13 @@ def lidar_pose_jacobian(nav: NavState) -> Float[Array, "6 24"]:
     position, rotation before translation, R <- Exp(turn) R, t <- t + move.
 
     The column of the time offset is zero. ``nav`` is the state at the instant of the lidar's stamp, because
-    propagation reads the inertial samples at time ``imu.time - time_offset``; an error of the offset shows in
-    the predicted pose, and its correlation with the pose comes from propagation. A column equal to the
-    lidar's twist belongs to the other convention, states kept by the IMU's clock: here it would count the
+    propagation reads the inertial samples at time ``imu.time - time_offset``. So an error of the offset is an
+    error of the predicted pose already, and propagation provides their correlation. A column equal to the
+    lidar's twist belongs to the other convention, with states on the IMU's clock; here it would count the
     offset twice.
+
+    Args:
+        nav: state at which to linearise.
     """
     R_world_imu = rotation_matrix(nav.T_world_imu.rotation())
     R_world_lidar = R_world_imu @ rotation_matrix(nav.T_imu_lidar.rotation())
@@ -42,18 +45,18 @@ def keep_observed(
     arm_squared: Float[Array, ""],
     degeneracy_ratio: Float[Array, ""],
 ) -> tuple[Float[Array, "6 6"], Float[Array, "6"], Bool[Array, "6"]]:
-    """Return a scan match without its degenerate directions, and which they are, weakest first.
+    """Return a scan match without its degenerate directions, and a mask of these, weakest direction first.
 
-    A direction with at most a share of the strongest direction's information is left to the prediction: what
-    little the scan seems to know there is the map's roughness (Zhang, Kaess & Singh, "On degeneracy of
-    optimization-based state estimation problems", ICRA 2016). Rotations are scaled by the scan's rms lever
-    arm so that all six directions are in metres.
+    A direction is degenerate if its information is at most a share of the strongest direction's. Its apparent
+    information comes from the map's roughness, so only the prediction determines it (Zhang, Kaess & Singh,
+    "On degeneracy of optimization-based state estimation problems", ICRA 2016). Rotations are multiplied by
+    the scan's rms lever arm, so that all six directions are in metres.
 
     Args:
-        information: on the pose of the sensor, rotation (rad) before translation (m).
-        gradient: of half the squared error with respect to the same perturbation.
+        information: information on the pose of the sensor, rotation (rad) before translation (m).
+        gradient: gradient of half the squared error by the same perturbation.
         arm_squared: mean squared distance of the points from the sensor, m^2.
-        degeneracy_ratio: that share; 0 drops only what has no information at all.
+        degeneracy_ratio: the share; 0 drops only directions without any information.
     """
     dtype = information.dtype
     scale = jnp.concatenate([jnp.full(3, 1.0) / jnp.sqrt(arm_squared + 1e-6), jnp.ones(3)]).astype(dtype)
@@ -66,7 +69,7 @@ def keep_observed(
 
 @eqx.filter_custom_jvp
 def _observed(information: Array, gradient: Array, degeneracy_ratio: Array) -> tuple[Array, Array, Array]:
-    """Return the information and the gradient in the directions that are not degenerate, and which are."""
+    """Return the information and the gradient in the other directions, and the mask of degenerate ones."""
     return _decomposed(information, gradient, degeneracy_ratio)[0]
 
 
@@ -74,8 +77,8 @@ def _observed(information: Array, gradient: Array, degeneracy_ratio: Array) -> t
 def _observed_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
     """Differentiate by the divided differences of eigenvalues (Daleckii & Krein 1965).
 
-    Only those between a kept and a dropped direction matter, and they can't vanish. Which directions are
-    dropped is a choice, without a derivative.
+    Only differences between a kept and a dropped direction occur, and they cannot vanish. The choice of the
+    dropped directions has no derivative.
     """
     (kept, along, degenerate), values, vectors = _decomposed(*primals)
     information_dot, gradient_dot = (
@@ -102,7 +105,7 @@ def _decomposed(information: Array, gradient: Array, degeneracy_ratio: Array) ->
 
 
 def measured_pose(nav: NavState, T_world_lidar: jaxlie.SE3, information: Float[Array, "6 6"]) -> Measurement:
-    """Return the measurement that a known lidar pose makes of the navigation state.
+    """Return the measurement of the navigation state by a measured lidar pose.
 
     Args:
         nav: state at which to linearise.

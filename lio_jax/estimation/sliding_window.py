@@ -1,4 +1,4 @@
-"""A chain of bounded length that follows the vehicle: what leaves it becomes the prior of what stays."""
+"""A chain of bounded length that follows the vehicle: states that leave it become the prior of the others."""
 
 import dataclasses
 
@@ -20,11 +20,12 @@ from lio_jax.imu.preintegration import Preintegrated
 
 
 class Window(eqx.Module):
-    """The latest states, oldest first, at most as many as there are rows."""
+    """The latest states, at most n of them, with their measurements; the oldest is first."""
 
     chain: Chain
+    """Measurements of the states."""
     states: MotionState
-    """n rows, those behind ``chain.count`` are padding."""
+    """n states; rows from ``chain.count`` on are padding."""
 
     def latest(self) -> MotionState:
         """Return the newest state."""
@@ -32,27 +33,27 @@ class Window(eqx.Module):
 
 
 class Added(eqx.Module):
-    """What comes with a new state."""
+    """The measurements of a new state."""
 
     link: Preintegrated
-    """From the latest state to the new one."""
+    """Preintegrated samples from the latest state to the new one."""
     lidar: PoseMeasurement
-    """Of the new state."""
+    """Pose of the new state by scan matching."""
     relative: RelativePose | None = None
-    """Of the new state in the frame of the latest one."""
+    """Pose of the new state in the frame of the latest one."""
     gps: PositionMeasurement | None = None
-    """Of the new state."""
+    """Position of the antenna at the new state."""
 
 
 def open_window(capacity: int, prior: Prior, gravity: Float[Array, "3"], first: Added) -> Window:
-    """Return a window of one state, the prior's mean.
+    """Return a window of one state, the mean of its prior.
 
     Args:
-        capacity: states it has room for, at least two.
-        prior: of the first state.
-        gravity: in world, m/s^2.
-        first: measurements of the first state; whether it has relative poses and GPS says whether the window
-            will have them. ``link`` and ``relative`` lead to no state yet and are not used otherwise.
+        capacity: largest number of states, at least two.
+        prior: prior of the first state.
+        gravity: m/s^2, in world.
+        first: measurements of the first state. The window has room for relative poses and GPS only if
+            ``first`` has them. Its ``link`` and ``relative`` are not used otherwise.
     """
     padding = Added(
         link=still_link(prior.gradient.dtype),
@@ -71,7 +72,14 @@ def open_window(capacity: int, prior: Prior, gravity: Float[Array, "3"], first: 
 
 
 def append(window: Window, added: Added) -> Window:
-    """Return the window with one more state, predicted from the latest one; a full one forgets its oldest."""
+    """Return the window with one more state, predicted from the latest one.
+
+    A full window forgets its oldest state first.
+
+    Args:
+        window: states and measurements.
+        added: measurements of the new state.
+    """
     full = window.chain.count == window.states.velocity.shape[0]
     window = jax.lax.cond(full, forget_oldest, lambda window: window, window)
     chain, row = window.chain, window.chain.count
@@ -86,7 +94,13 @@ def append(window: Window, added: Added) -> Window:
 
 
 def update(window: Window, *, max_iterations: int, tolerance: Float[Array, ""]) -> tuple[Window, Smoothed]:
-    """Return the window with its states smoothed, and the result; arguments as of :func:`smooth`."""
+    """Return the window with its states smoothed, and the smoother's result.
+
+    Args:
+        window: states and measurements.
+        max_iterations: see :func:`smooth`.
+        tolerance: see :func:`smooth`.
+    """
     smoothed = smooth(window.chain, window.states, max_iterations=max_iterations, tolerance=tolerance)
     return Window(window.chain, smoothed.states), smoothed
 
@@ -94,19 +108,22 @@ def update(window: Window, *, max_iterations: int, tolerance: Float[Array, ""]) 
 def append_and_update(
     window: Window, added: Added, *, max_iterations: int, tolerance: Float[Array, ""]
 ) -> tuple[Window, Smoothed]:
-    """Return the window with one more state, all of them smoothed, and the smoother's result."""
+    """Return the window with one more state and all states smoothed, and the smoother's result."""
     return update(append(window, added), max_iterations=max_iterations, tolerance=tolerance)
 
 
 def forget_oldest(window: Window) -> Window:
-    """Return the window without its first state, of at least two, whose knowledge goes into the prior.
+    """Return the window without its first state, which is marginalised into the prior of the second.
 
-    What is linearised is linearised where the states stand now, robust weights included, for good: the
-    approximation of every fixed-lag smoother (Sibley et al., JFR 2010).
+    The marginalised measurements stay linearised at the current states, with their current robust weights.
+    This is the approximation of every fixed-lag smoother (Sibley et al., JFR 2010).
+
+    Args:
+        window: at least two states.
     """
     chain = window.chain
     pair = eqx.tree_at(lambda chain: chain.count, chain.map_rows(lambda leaf: leaf[:2]), jnp.int32(2))
-    # the second state's own measurements stay behind
+    # the second state's own measurements are not marginalised
     pair = eqx.tree_at(lambda chain: chain.lidar.mask, pair, pair.lidar.mask.at[1].set(False))
     if pair.gps is not None:
         pair = eqx.tree_at(lambda chain: chain.gps.mask, pair, pair.gps.mask.at[1].set(False))
@@ -139,7 +156,7 @@ def _with_measurements(window: Window, added: Added, row: Array) -> Window:
 
 
 def still_link(dtype: jnp.dtype) -> Preintegrated:
-    """Return a link that is padding."""
+    """Return a link for padding: no motion, and unit covariance."""
     return Preintegrated(
         duration=jnp.zeros((), dtype),
         rotation=jaxlie.SO3(jnp.array([1, 0, 0, 0], dtype)),

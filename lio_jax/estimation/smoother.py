@@ -1,8 +1,9 @@
-"""The most probable states of a chain: a window's, or a whole recording's.
+"""The most probable states of a chain, that of a window or of a whole recording.
 
-Gauss-Newton on all states at once, with a damped step (Levenberg-Marquardt) where a full one would not pay;
-block-tridiagonal Cholesky makes it linear in the number of states (Barfoot, "State estimation for robotics",
-2017, chapter 3). Run it in float64: the information of 0.1 s of inertial samples is 1e10 times a prior's.
+The method is Gauss-Newton on all states at once, with a damped step (Levenberg-Marquardt) where a full step
+does not lower the cost. Block-tridiagonal Cholesky makes the cost of a step linear in the number of states
+(Barfoot, "State estimation for robotics", 2017, chapter 3). Run it in float64: the information of 0.1 s of
+inertial samples is 1e10 times that of a prior.
 """
 
 from typing import Any, NamedTuple
@@ -20,26 +21,28 @@ from lio_jax.estimation.motion_state import DOF, MotionState
 
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING = 1e-6
-"""Less than this is none."""
+"""Damping below which it becomes zero."""
 _MOST_DAMPING = 1e8
+"""Damping at which the search ends without convergence."""
 _WORTH = 10.0
-"""Factor of the damping when a step pays or doesn't."""
+"""Factor by which the damping changes after each step."""
 
 
 class Smoothed(eqx.Module):
     """The result of a smoother."""
 
     states: MotionState
+    """The most probable n states."""
     normal: Normal
-    """At ``states``."""
+    """Normal equations at ``states``."""
     status: Int32[Array, ""]
-    """CONVERGED, ITERATION_LIMIT or NOT_FINITE; after the last the states are the last good ones."""
+    """CONVERGED, ITERATION_LIMIT or NOT_FINITE; in the last case the states are the last finite ones."""
     iterations: Int32[Array, ""]
-    """Linearisations."""
+    """Number of linearisations."""
     decrement: Float[Array, ""]
-    """How far the minimum is, sigmas: sqrt(step' H step) of the step that was not taken any more."""
+    """Distance from the minimum, standard deviations: sqrt(step' H step) of the next step, not taken."""
     unmeasured: Int32[Array, ""]
-    """Links without inertial samples."""
+    """Number of links without inertial samples."""
 
     def covariances(self) -> Float[Array, "n 15 15"]:
         """Return the marginal covariance of each state's error; the identity for padding."""
@@ -48,10 +51,11 @@ class Smoothed(eqx.Module):
 
 class _Loop(NamedTuple):
     trial: MotionState
+    """The states after the last step, whose cost is not known yet."""
     states: MotionState
-    """The best so far."""
+    """The best states so far."""
     normal: Normal
-    """At ``states``."""
+    """Normal equations at ``states``."""
     damping: Float[Array, ""]
     decrement: Float[Array, ""]
     iterations: Int32[Array, ""]
@@ -59,7 +63,7 @@ class _Loop(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """What the derivative takes for constant."""
+    """The part of the result that the derivative takes as constant."""
 
     states: MotionState
     decrement: Float[Array, ""]
@@ -76,15 +80,15 @@ def smooth(
 ) -> Smoothed:
     """Return the states that agree best with all measurements of a chain.
 
-    Derivatives with respect to everything in the chain are those of the converged solution, by the implicit
-    function theorem with the exact second derivatives: don't trust them where ``status`` is not CONVERGED.
-    First order only.
+    Derivatives by all values in the chain are those of the converged solution, by the implicit function
+    theorem with the exact second derivatives. Do not use them where ``status`` is not CONVERGED. Only first
+    derivatives are correct.
 
     Args:
-        chain: n rows, at least two; padding behind ``chain.count`` states.
-        guess: n rows: the first iterate.
-        max_iterations: linearisations at most, at least 1; one where the cost is no lower counts too.
-        tolerance: converged when the next step would be shorter than this, sigmas.
+        chain: n rows, at least two; rows from ``chain.count`` on are padding.
+        guess: n states, the first iterate.
+        max_iterations: largest number of linearisations, at least 1, those of rejected steps included.
+        tolerance: length of the next step below which the solve has converged, standard deviations.
     """
     problem = Problem(_solve, _no_probe, _gradient, _report, inverse_slope=_inverse_hessian)
     solution = implicit(problem, (chain, guess, tolerance, max_iterations))
@@ -148,7 +152,7 @@ def _solve(inputs: Any) -> Solution:
 
 
 def _damped(matrix: BlockTridiagonal, damping: Array) -> BlockTridiagonal:
-    """Return the matrix with its diagonal made larger by a share of itself (Marquardt 1963)."""
+    """Return the matrix with its diagonal increased by a share of itself (Marquardt 1963)."""
     scale = 1 + damping * jnp.eye(DOF, dtype=matrix.diagonal.dtype)
     return BlockTridiagonal(matrix.diagonal * scale, matrix.coupling)
 
@@ -158,7 +162,7 @@ def _no_probe(error: Array, found: _Found, inputs: Any) -> None:
 
 
 def _gradient(error: Array, probed: None, found: _Found, inputs: Any) -> Array:
-    """Return the gradient at the states that ``error`` leads to from the solution: zero at zero."""
+    """Return the gradient of the cost at the solution perturbed by ``error``; it vanishes at zero error."""
     return _report(error, probed, found, inputs)[1].gradient.ravel()
 
 

@@ -1,1 +1,1 @@
-"""Inertial measurements: sampling, preintegration, strapdown propagation, pose at any time."""
+"""Inertial measurements: sampling, preintegration, propagation, poses at any time, and the first state."""

@@ -1,4 +1,4 @@
-"""Allan deviation of an inertial sensor at rest, and the noise densities it shows."""
+"""Allan deviation of an inertial sensor at rest, and the noise densities that fit it."""
 
 from dataclasses import dataclass
 
@@ -7,30 +7,32 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 POINTS_PER_DECADE = 12
+"""Number of averaging times per factor of ten."""
 _LONGEST_SHARE = 1 / 9
-"""Averaging times beyond this share of the recording rest on too few averages."""
+"""Longest averaging time as a share of the recording: longer ones have too few averages."""
 _MODEL_ERROR = 0.05
-"""Relative error of the noise model itself: keeps the many short averages from deciding alone."""
+"""Relative error of the noise model: without it the many short averages would determine the fit alone."""
 _HUBER = 2.0
 _FIT_ROUNDS = 10
 _CLEAR = 3.0
-"""A random walk is stated where it is this many standard deviations from zero ..."""
+"""Least distance from zero of a random walk that is reported, in standard deviations."""
 _VISIBLE = 0.25
-"""... and makes at least this share of the variance at the longest averaging time."""
+"""Least share of a random walk that is reported in the variance at the longest averaging time."""
 
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """The noise densities of one axis, as continuous-time densities."""
+    """The continuous-time noise densities of one axis."""
 
     white: float
-    """Unit of the signal per sqrt(Hz): the slope -1/2 read at 1 s."""
+    """Density of the white noise, unit of the signal per sqrt(Hz): the line of slope -1/2 at 1 s."""
     walk: float | None
-    """Unit of the signal per s and sqrt(Hz): the slope +1/2 read at 3 s; None where it does not show."""
+    """Density of the random walk, unit of the signal per s and sqrt(Hz): the line of slope +1/2 at 3 s. None
+    where it is not significant."""
     flicker: float
-    """Bias instability: the flat part's Allan deviation, unit of the signal."""
+    """Bias instability, unit of the signal: the Allan deviation of the flat part."""
     quantisation: float
-    """Unit of the signal times s."""
+    """Quantisation noise, unit of the signal times s."""
 
     def deviation(self, tau: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the Allan deviation of the fitted noise at averaging times ``tau``, s."""
@@ -41,7 +43,14 @@ class NoiseFit:
 
 
 def averaging_factors(count: int) -> NDArray[np.int64]:
-    """Return numbers of samples to average over, evenly spread in the logarithm, for ``count`` samples."""
+    """Return the numbers of samples to average over, evenly spaced in the logarithm.
+
+    Args:
+        count: number of samples in the recording.
+
+    Returns:
+        (k,) distinct numbers, ascending; none for fewer than nine samples.
+    """
     longest = int(count * _LONGEST_SHARE)
     if longest < 1:
         return np.zeros(0, np.int64)
@@ -56,14 +65,14 @@ def allan_deviation(
     """Return the overlapping Allan deviation of each column (IEEE Std 952-1997, annex C).
 
     Args:
-        samples: (m, columns) at a steady rate.
-        interval: between samples, s.
+        samples: (m, columns) at a constant rate.
+        interval: time between two samples, s.
         factors: (k,) numbers of samples averaged, each at most (m - 1) / 2.
 
     Returns:
         (k, columns) in the unit of the samples.
     """
-    # the mean is removed because a sum over an hour would cost its digits
+    # the mean is removed, because a sum over an hour would lose digits
     integral = np.zeros((len(samples) + 1, samples.shape[1]))
     np.cumsum((samples - samples.mean(axis=0)) * interval, axis=0, out=integral[1:])
     deviations = np.empty((len(factors), samples.shape[1]))
@@ -76,14 +85,15 @@ def allan_deviation(
 def fit_noise(tau: NDArray[np.float64], deviation: NDArray[np.float64], duration: float) -> NoiseFit:
     """Fit quantisation, white noise, flicker and random walk to an Allan deviation.
 
-    The variance is their sum, so a non-negative least-squares fit of its relative error finds them all at
-    once and none has to be read off a range where it may not be alone. Averaging times whose variance does
-    not fit (vibration, filters) lose weight (Huber). Weights follow the number of independent averages.
+    The Allan variance is the sum of the four parts. One non-negative least-squares fit of its relative error
+    finds all of them, so no part has to be read from a range of averaging times that another part may
+    disturb. The weights follow from the number of independent averages. Averaging times whose variance does
+    not fit, because of vibration or filters, lose weight (Huber).
 
     Args:
         tau: (k,) averaging times, s.
-        deviation: (k,) Allan deviation.
-        duration: of the recording, s.
+        deviation: (k,) Allan deviations, unit of the signal.
+        duration: length of the recording, s.
     """
     if not deviation.any():
         return NoiseFit(white=0.0, walk=None, flicker=0.0, quantisation=0.0)

@@ -1,4 +1,4 @@
-"""Discrete noise of continuous-time densities, and the covariance that it adds over many samples."""
+"""Discrete noise from continuous-time densities, and the covariance that it adds over many intervals."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,44 +8,46 @@ from lio_jax.core.prefix_sum import prefix_sum
 from lio_jax.imu.params import ImuParams
 
 UNKNOWN_RATE = 0.3
-"""Angular rate where no sample tells it, as white noise, rad/s/sqrt(Hz): 0.1 rad after 0.1 s."""
+"""White noise in place of an unmeasured angular rate, rad/s/sqrt(Hz): 0.1 rad after 0.1 s."""
 UNKNOWN_ACCEL = 3.0
-"""Acceleration where no sample tells it, as white noise, m/s^2/sqrt(Hz): 1 m/s after 0.1 s."""
+"""White noise in place of an unmeasured acceleration, m/s^2/sqrt(Hz): 1 m/s after 0.1 s."""
 
 DENSE = 0.03
-"""Samples no farther apart than this, s, leave nothing untold between them."""
+"""Longest time between two samples, s, for which interpolation between them adds no noise."""
 UNTOLD_RATE = 0.3
-"""How far the angular rate strays between sparser samples, rad/s per s between them."""
+"""Error of the interpolated angular rate between sparser samples, rad/s per second between them."""
 UNTOLD_ACCEL = 6.0
-"""How far the acceleration strays between sparser samples, m/s^2 per s between them."""
+"""Error of the interpolated specific force between sparser samples, m/s^2 per second between them."""
 
 
 class IntervalNoise(eqx.Module):
-    """Variances per axis of what disturbs each interval."""
+    """Variances per axis of the noise in each of n intervals."""
 
     gyro: Float[Array, " n"]
-    """Of the mean angular rate, (rad/s)^2."""
+    """Variance of the mean angular rate, (rad/s)^2."""
     accel: Float[Array, " n"]
-    """Of the mean specific force, (m/s^2)^2."""
+    """Variance of the mean specific force, (m/s^2)^2."""
     gyro_bias: Float[Array, " n"]
-    """Of the gyroscope's bias at the end against that at the start, (rad/s)^2."""
+    """Variance of the change of the gyroscope's bias over the interval, (rad/s)^2."""
     accel_bias: Float[Array, " n"]
-    """Of the accelerometer's bias at the end against that at the start, (m/s^2)^2."""
+    """Variance of the change of the accelerometer's bias over the interval, (m/s^2)^2."""
 
 
 def discretise(
     params: ImuParams, duration: Float[Array, " n"], gap: Float[Array, " n"], known: Bool[Array, " n"]
 ) -> IntervalNoise:
-    """Return the variances of what is constant in an interval of h seconds.
+    """Return the variances of the mean inputs, and of the change of the biases, in intervals of h seconds.
 
-    White noise: density^2 / h; a random walk from start to end: density^2 h. Linear
-    in the squares of the densities. An interval of no duration has no noise.
+    White noise has the variance density^2 / h, the change of a random walk density^2 h. The variances are
+    linear in the squares of the densities. An interval of zero duration has no noise.
 
     Args:
-        params: the sensor's densities.
-        duration: h, s.
-        gap: between the samples around the interval, s: far apart, they leave motion untold.
-        known: False where no sample tells the motion: it is then white noise of the densities above.
+        params: the sensor's noise densities.
+        duration: h of each interval, s.
+        gap: time between the two samples around each interval, s. Above ``DENSE`` the error of the
+            interpolation is added.
+        known: False where no sample is near. The motion is then white noise of the densities
+            ``UNKNOWN_RATE`` and ``UNKNOWN_ACCEL``.
     """
     real = duration > 0
     per_second = jnp.where(real, 1 / jnp.where(real, duration, 1.0), 0.0)
@@ -66,17 +68,18 @@ def discretise(
 def process_noise(
     inputs: Float[Array, "n r 6"], noise: IntervalNoise, measured: Bool[Array, ""] | bool = True
 ) -> Float[Array, "r+6 r+6"]:
-    """Return the covariance of r results and the biases' drift; linear in the noise's variances.
+    """Return the covariance of r results and of the biases' drift, which is linear in the noise's variances.
 
-    A bias steps at the end of each interval, so it acts from the next one on.
+    The biases change at the end of each interval, so a change acts on the later intervals only.
 
     Args:
-        inputs: how each interval's inputs act on the results, such as ``Sensitivity.inputs``.
-        noise: of each interval.
-        measured: False if the biases have no effect, because there are no samples they would be taken from.
+        inputs: derivative of the results with respect to each interval's angular rate (rad/s) and specific
+            force (m/s^2), such as ``Sensitivity.inputs``.
+        noise: variances of each interval.
+        measured: False where there are no samples. The biases then have no effect on the results.
 
     Returns:
-        Order: the results, gyro bias, accelerometer bias.
+        The covariance of the results, the gyroscope's bias and the accelerometer's bias, in this order.
     """
     later = jnp.where(measured, prefix_sum(inputs) - jnp.sum(inputs, axis=0), 0.0)
     unit = jnp.broadcast_to(jnp.eye(6, dtype=inputs.dtype), (len(inputs), 6, 6))

@@ -1,6 +1,7 @@
-"""Poses at the inertial sensor's rate, propagated from the latest corrected state anew after each correction.
+"""Poses at the rate of the inertial sensor, propagated from the latest corrected state.
 
-LIO-SAM's IMU odometry and TransformFusion in one: the corrected states are the filter's or the map's.
+The module covers LIO-SAM's IMU odometry and its TransformFusion: the corrected states may be those of the
+filter or those of the map.
 """
 
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ from lio_jax.core.types import ImuBatch, NavState
 from lio_jax.imu.strapdown import path_along
 
 _SMALLEST_BATCH = 32
-"""Samples a batch is padded to at least; longer ones to a power of two, so that few shapes are compiled."""
+"""Least padded size of a batch. Larger batches are padded to a power of two, so that few shapes compile."""
 
 
 def poses_at_samples(
@@ -26,15 +27,15 @@ def poses_at_samples(
     """Return T_world_imu at each of m samples, propagated from the state at ``start``.
 
     Args:
-        nav: at ``start``, just corrected.
-        imu: from the last sample before ``start`` to the first one after ``end``; in ascending order, padding
-            last, all values finite.
-        start: s, same origin as the samples' times.
-        end: when the next correction arrives, s.
+        nav: the corrected state at ``start``.
+        imu: m samples, from the last one before ``start`` to the first one after ``end``. They are in
+            ascending order, with the padding last, and all values are finite.
+        start: on the lidar's clock, s, from the same origin as the samples' times.
+        end: time of the next correction, on the lidar's clock, s.
 
     Returns:
-        The poses, and where they hold: at real samples after ``start`` and not after ``end``. Elsewhere the
-        pose is that at the nearer end.
+        The poses (m), and a mask of the valid ones: those of real samples after ``start`` and not after
+        ``end``. Elsewhere the pose is that at the nearer end of the span.
     """
     path = path_along(nav, imu, start, end)
     time = imu.time.astype(path.time.dtype) - nav.time_offset
@@ -56,14 +57,15 @@ def imu_rate_trajectory(
     """Return the pose at every inertial sample between the first and the last corrected state.
 
     Args:
-        stamps_ns: times of the k states on the lidar's clock, ascending.
-        states: corrected, at the scans' ends.
-        imu_stamps_ns: times of n samples on the IMU's clock, ascending.
-        gyro: (n, 3) rad/s.
-        accel: (n, 3) m/s^2.
+        stamps_ns: (k,) times of the states on the lidar's clock, ns, ascending.
+        states: the k corrected states, at the scans' ends.
+        imu_stamps_ns: (n,) times of the samples on the IMU's clock, ns, ascending.
+        gyro: (n, 3) angular rates in the IMU frame, rad/s.
+        accel: (n, 3) specific forces in the IMU frame, m/s^2.
 
     Returns:
-        Times on the lidar's clock, and as many rows w x y z, position in m, of T_world_imu.
+        (r,) times on the lidar's clock, ns, and the (r, 7) poses T_world_imu there: the quaternion w x y z,
+        then the position in m.
 
     Raises:
         LioJaxError: if the numbers of stamps and states differ, or times do not ascend.

@@ -1,9 +1,9 @@
-"""Motion since the first instant of a chain of intervals, and its sensitivity to each interval's inputs.
+"""Motion since the start of a chain of intervals, and its derivative by each interval's inputs.
 
-Everything is relative to the frame of the first instant, where the recursions of Forster et al. ("On-manifold
-preintegration for real-time visual-inertial odometry", T-RO 2017) become prefix sums: only the product of the
-rotations is sequential. A disturbance of one interval reaches the end as a rotation about what has been
-gained since then, so no chain of transition matrices is needed.
+All quantities are expressed in the frame of the first instant. There the recursions of Forster et al.
+("On-manifold preintegration for real-time visual-inertial odometry", T-RO 2017) become prefix sums, and only
+the product of the rotations is sequential. The effect of an interval's disturbance on the end follows from
+the velocity and position gained since then, so no chain of transition matrices is needed.
 """
 
 import equinox as eqx
@@ -18,32 +18,33 @@ from lio_jax.core.prefix_sum import prefix_sum
 from lio_jax.imu.rotation_integrals import integral_derivatives, rotation_exponential, rotation_integrals
 
 NAV_DOF = 9
-"""Rotation, position, velocity, in the frame of the last instant: the order of the error state."""
+"""Size of an error of rotation (rad), position (m) and velocity (m/s), in the order of the error state."""
 
 
 class Increments(eqx.Module):
-    """Rotation, velocity and position gained since the first of n + 1 knots, without gravity."""
+    """Rotation, velocity and position gained since the first of k knots, without gravity."""
 
     time: Float[Array, " k"]
-    """Since the first knot, s."""
+    """Time since the first knot, s."""
     rotation: jaxlie.SO3
-    """IMU frame at each knot to the first's, k."""
+    """Rotation from the IMU frame of each of the k knots to that of the first knot."""
     velocity: Float[Array, "k 3"]
-    """m/s, in the first frame."""
+    """Velocity gained since the first knot, m/s, in the IMU frame of the first knot."""
     position: Float[Array, "k 3"]
-    """m, in the first frame."""
+    """Position gained since the first knot, m, in the IMU frame of the first knot."""
 
 
 class Sensitivity(eqx.Module):
-    """Derivative of the last increments' error with respect to the inputs of each of n intervals.
+    """Derivative of the last increments with respect to the inputs of each of n intervals.
 
-    The error is a right perturbation: rotation, position and velocity in the last knot's frame.
+    The nine rows are a right perturbation: rotation (rad), position (m) and velocity (m/s) in the last knot's
+    frame.
     """
 
     inputs: Float[Array, "n 9 6"]
-    """Per angular rate, s, then per specific force."""
+    """Derivative with respect to the angular rate (rad/s), then to the specific force (m/s^2)."""
     duration: Float[Array, "n 9"]
-    """Per duration, with the end at its time."""
+    """Derivative with respect to the duration of the interval (s), later intervals unchanged."""
 
 
 def accumulate(
@@ -53,15 +54,15 @@ def accumulate(
     turning: bool = True,
     parallel: bool = False,
 ) -> Increments:
-    """Return the increments at all knots of n intervals.
+    """Return the increments at all n + 1 knots of n intervals.
 
     Args:
-        duration: s.
-        rate: angular rate without bias, rad/s.
-        accel: specific force without bias, m/s^2.
-        turning: hold the force in the turning body's frame (exact for constant inputs); otherwise in the
-            frame of the interval's start, as Forster et al. do.
-        parallel: multiply the rotations by an associative scan instead of one after the other.
+        duration: length of each interval, s.
+        rate: angular rate without bias, rad/s, IMU frame.
+        accel: specific force without bias, m/s^2, IMU frame.
+        turning: True: the specific force is constant in the turning IMU frame, which is exact for constant
+            inputs. False: it is constant in the IMU frame of the interval's start, as in Forster et al.
+        parallel: multiply the rotations by an associative scan instead of a sequential one.
     """
     turn = jaxlie.SO3.exp(rate * duration[:, None]).wxyz
     if parallel:
@@ -85,7 +86,15 @@ def sensitivity(
     accel: Float[Array, "n 3"],
     turning: bool = True,
 ) -> Sensitivity:
-    """Return how the last of :func:`accumulate`'s increments depends on each interval's inputs."""
+    """Return the derivative of the last of :func:`accumulate`'s increments by each interval's inputs.
+
+    Args:
+        increments: the result of :func:`accumulate` for the same inputs.
+        duration: length of each interval, s.
+        rate: angular rate without bias, rad/s, IMU frame.
+        accel: specific force without bias, m/s^2, IMU frame.
+        turning: as in :func:`accumulate`.
+    """
     matrix = rotation_matrix(increments.rotation)
     start, back = matrix[:-1], matrix[-1].T
     first, second = _integrals(rate * duration[:, None], turning)
@@ -96,12 +105,12 @@ def sensitivity(
     h = duration[:, None, None]
     first_by, second_by = _by_rotvec(rate * duration[:, None], accel, turning)
     zero = jnp.zeros_like(turned)
-    # impulses at the end of each interval, in the first frame: columns rate, specific force, duration
+    # effects at the end of each interval, in the first frame: columns rate, specific force, duration
     rotation = jnp.concatenate([h * turned, zero, (start @ rate[..., None])], -1)
     velocity = start @ jnp.concatenate([h**2 * first_by, h * first, by_duration], -1)
     position = start @ jnp.concatenate([h**3 * second_by, h**2 * second, way_by_duration], -1)
     position = position.at[..., 6].add(increments.velocity[:-1])
-    # what the impulses have become at the end
+    # the same effects at the last knot
     left = (increments.time[-1] - increments.time[1:])[:, None, None]
     speed = increments.velocity[-1] - increments.velocity[1:]
     way = increments.position[-1] - increments.position[1:] - increments.velocity[1:] * left[..., 0]
@@ -120,11 +129,13 @@ def sensitivity(
 def nav_transition(
     rotation: jaxlie.SO3, velocity: Float[Array, "3"], position: Float[Array, "3"], elapsed: Float[Array, ""]
 ) -> Float[Array, "9 9"]:
-    """Return how an error of rotation, position and velocity at the first knot shows at the last one.
+    """Return the transition matrix of an error of rotation, position and velocity over a span.
 
     Args:
-        rotation: gained, as are ``velocity`` (m/s) and ``position`` (m), in the first frame.
-        elapsed: s.
+        rotation: from the IMU frame at the end of the span to that at its start.
+        velocity: gained over the span without gravity, m/s, in the first IMU frame.
+        position: gained over the span without gravity and initial velocity, m, in the first IMU frame.
+        elapsed: length of the span, s.
     """
     back = rotation_matrix(rotation).T
     by_position, by_velocity = -back @ skew(jnp.stack([position, velocity]))
@@ -147,7 +158,7 @@ def _integrals(rotvec: Float[Array, "n 3"], turning: bool) -> tuple[Array, Array
 
 
 def _gain(rate: Array, accel: Array, duration: Array, turning: bool) -> tuple[Array, Array]:
-    """Return velocity and way gained within each interval from rest, in its first frame."""
+    """Return the velocity (m/s) and the way (m) gained within each interval from rest, in its first frame."""
     h = duration[:, None]
     first, second = _integrals(rate * h, turning)
     return h * (first @ accel[..., None])[..., 0], h**2 * (second @ accel[..., None])[..., 0]

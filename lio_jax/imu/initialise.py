@@ -1,4 +1,4 @@
-"""The first navigation state of a vehicle at rest: level, biases and their joint uncertainty."""
+"""The first navigation state of a vehicle at rest: attitude, biases and their joint covariance."""
 
 import equinox as eqx
 import jax
@@ -25,32 +25,35 @@ from lio_jax.core.types import ImuBatch, NavState, initial_nav_state
 from lio_jax.imu.params import ImuParams, InitialParams
 
 MIN_SAMPLES = 5
-"""Fewer samples cannot show that the vehicle is at rest."""
+"""Least number of samples that can show that the vehicle is at rest."""
 
 STILL_GYRO = 0.02
-"""Scatter of the angular rate that a running engine may cause at rest, beside the sensor's noise, rad/s."""
+"""Standard deviation of the angular rate that a running engine adds to the sensor's noise at rest, rad/s."""
 STILL_ACCEL = 0.2
-"""The same of the specific force, m/s^2."""
+"""Standard deviation of the specific force that a running engine adds to the noise at rest, m/s^2."""
 STILL_RATE = 0.1
-"""A larger mean rate is taken for a turn, not for a gyro bias, rad/s."""
+"""Largest mean angular rate at rest, rad/s: a larger one is a turn and not a bias."""
 STILL_MISFIT = 0.05
-"""A mean specific force farther than this from gravity's strength, as a share of it, is not rest."""
+"""Largest relative difference between the mean specific force and gravity at rest."""
 MOVING_ACCEL = 1.0
 """Standard deviation of a moving vehicle's mean acceleration over about a second, m/s^2."""
 MOVING_SPEED = 10.0
 """Standard deviation of a moving vehicle's first velocity per axis, m/s."""
 _UNKNOWN_TILT = 1.0
-"""Standard deviation of roll and pitch before gravity was looked at, rad."""
+"""Prior standard deviation of roll and pitch, before the specific force is used, rad."""
 
 
 class RestStart(eqx.Module):
     """A first navigation state from samples that should be of a vehicle at rest."""
 
     start: NavEstimate
-    """At rest: levelled, biases found, velocity zero. Else: levelled roughly, biases zero, velocity open."""
+    """The state and its covariance. At rest it is level, with the estimated biases and zero velocity. In
+    motion the level is rough, the biases are zero and the velocity is unknown."""
     is_still: Bool[Array, ""]
+    """Whether the samples are those of a vehicle at rest."""
     accel_scale: Float[Array, ""]
-    """Mean specific force over gravity: 1 for an ideal accelerometer at rest; 0 without samples."""
+    """Magnitude of the mean specific force over that of gravity: 1 for an ideal accelerometer at rest, 0
+    without samples."""
     gyro_scatter: Float[Array, ""]
     """Standard deviation of the angular rate over all axes, rad/s."""
     accel_scatter: Float[Array, ""]
@@ -66,18 +69,18 @@ def initialise_at_rest(
 ) -> RestStart:
     """Return the state of a vehicle that stood still while the samples were taken.
 
-    The mean angular rate is the gyro bias, the mean specific force points up (yaw is zero) and what it
-    exceeds gravity by is accelerometer bias along it; both biases are drawn towards zero by their prior
-    sigmas. Bias across gravity cannot be told from tilt, so the covariance couples the two. A zero sigma in
-    ``initial`` leaves that part of the state as it is, without uncertainty. A vehicle that turns out to move
-    is levelled as well, with an uncertainty that allows for its acceleration.
+    The mean angular rate is the gyroscope's bias. The mean specific force points up, and yaw is zero. The
+    difference between its magnitude and gravity is the accelerometer's bias along it. The prior keeps both
+    biases near zero. A bias normal to gravity is not observable apart from tilt, so the covariance couples
+    the two. A zero sigma in ``initial`` leaves that part of the state as it is, without uncertainty. If the
+    vehicle moves, the state is levelled as well, with an uncertainty that allows for its acceleration.
 
     Args:
-        imu: about one second of samples up to the first pose.
-        params: the noise densities say what scatter is noise.
+        imu: about one second of samples before the first pose.
+        params: the magnitude of gravity, and the noise densities, which bound the scatter at rest.
         initial: prior standard deviations.
-        T_imu_lidar: extrinsic.
-        time_offset: of the lidar's clock, s.
+        T_imu_lidar: extrinsic pose of the lidar in the IMU frame.
+        time_offset: lag of the lidar's clock, s.
     """
     present = jnp.any(imu.mask)
     count = jnp.maximum(jnp.sum(imu.mask), 1)
@@ -129,7 +132,11 @@ def initialise_at_rest(
 
 
 def levelled(up: Float[Array, "3"]) -> jaxlie.SO3:
-    """Return the rotation world from imu with yaw zero for which ``up`` (imu frame) is world z."""
+    """Return the rotation from the IMU frame to world that has zero yaw and maps ``up`` to world z.
+
+    Args:
+        up: a vector of any length in the IMU frame.
+    """
     roll = jnp.arctan2(up[1], up[2])
     pitch = jnp.arctan2(-up[0], jnp.hypot(up[1], up[2]))
     half = jnp.stack([roll, pitch]) / 2
@@ -138,7 +145,7 @@ def levelled(up: Float[Array, "3"]) -> jaxlie.SO3:
 
 
 def _prior(nav: NavState, initial: InitialParams, is_still: Bool[Array, ""]) -> Float[Array, "24 24"]:
-    """Return the covariance before the samples were looked at: tilt open, heading fixed."""
+    """Return the prior covariance of the error state: tilt unknown, heading fixed."""
     velocity = jnp.where(is_still, initial.velocity_sigma, jnp.hypot(initial.velocity_sigma, MOVING_SPEED))
     parts = (
         (VELOCITY, velocity),
@@ -166,7 +173,7 @@ def _seen_at_rest(
     accel_variance: Float[Array, ""],
     use_gyro: Bool[Array, ""],
 ) -> tuple[Float[Array, "24"], Float[Array, "24 24"]]:
-    """Return mean and covariance of the error state once the mean samples are known (a Kalman update)."""
+    """Return mean and covariance of the error state given the mean samples, by a Kalman update."""
     back = rotation_matrix(nav.T_world_imu.rotation()).T
     force = -back @ nav.gravity
     identity = jnp.eye(3, dtype=prior.dtype)
@@ -178,7 +185,7 @@ def _seen_at_rest(
         (accel_rows, ROTATION, skew(force)),
         (accel_rows, GRAVITY, back @ skew(nav.gravity) @ sphere_basis(nav.gravity)),
     )
-    # an unused row has no variance of its own and would make the system singular
+    # the rows of an unused gyroscope are zero: without a variance the system would be singular
     gyro_variance = jnp.where(use_gyro, gyro_variance, 1.0)
     R = from_blocks(
         (6, 6),
@@ -196,7 +203,7 @@ def _seen_at_rest(
 def _mean_and_variance(
     samples: Float[Array, "s m 3"], mask: Bool[Array, " m"]
 ) -> tuple[Float[Array, "s 3"], Float[Array, "s 3"]]:
-    """Return mean and scatter per sensor and axis over the real samples; zeros where there are none."""
+    """Return mean and variance per sensor and axis over the real samples; zeros where there are none."""
     count = jnp.sum(mask)
     mean = jnp.sum(jnp.where(mask[:, None], samples, 0.0), axis=1) / jnp.maximum(count, 1)
     square = jnp.sum(jnp.where(mask[:, None], (samples - mean[:, None]) ** 2, 0.0), axis=1)
@@ -209,20 +216,20 @@ def _is_steady(
     variance: Float[Array, " s"],
     noise_variance: Float[Array, " s"],
 ) -> Bool[Array, ""]:
-    """Return whether scatter and drift are those of a gyroscope and an accelerometer at rest."""
+    """Return whether variance and drift are those of a gyroscope and an accelerometer at rest."""
     tolerance = jnp.array([STILL_GYRO, STILL_ACCEL], variance.dtype)
     rank = running_count(mask)
     early, _ = _mean_and_variance(samples, mask & (rank * 2 <= rank[-1]))
     late, _ = _mean_and_variance(samples, mask & (rank * 2 > rank[-1]))
     half = jnp.maximum(rank[-1] / 2, 1.0)
-    # a slow start hides in the noise of single samples but not in their mean
+    # a slow start is below the noise of single samples, but not below that of their mean
     drift = jnp.linalg.norm(late - early, axis=1)
     calm = variance < tolerance**2 + 4 * noise_variance
     return jnp.all(calm & (drift < tolerance + 4 * jnp.sqrt(2 * variance / half)))
 
 
 def _sample_rate(imu: ImuBatch) -> Float[Array, ""]:
-    """Return the samples' rate, Hz; 0 where fewer than two."""
+    """Return the rate of the samples, Hz; 0 for fewer than two samples."""
     first = jnp.min(jnp.where(imu.mask, imu.time, jnp.inf))
     last = jnp.max(jnp.where(imu.mask, imu.time, -jnp.inf))
     intervals = jnp.sum(imu.mask) - 1

@@ -1,4 +1,9 @@
-"""Start a filter from a moving vehicle: align the poses of scan matching with the inertial samples."""
+"""Start a filter on a moving vehicle: align poses of scan matching with preintegrated inertial samples.
+
+A first least-squares problem finds the gyroscope's bias from the rotations between the poses. A second one
+finds the velocities, gravity and the accelerometer's bias from their positions. The result is a navigation
+state with its covariance in a level world.
+"""
 
 from collections.abc import Callable
 
@@ -29,26 +34,34 @@ from lio_jax.imu.preintegration import Preintegrated, preintegrate_parallel
 from lio_jax.imu.sampling import sample_intervals
 
 SPHERE_ROUNDS = 4
+"""Gauss-Newton iterations of :func:`align`; after each, gravity is scaled to its known magnitude."""
 
 
 class Scale(eqx.Module):
-    """Standard deviations that whiten the alignment's equations."""
+    """Standard deviations that whiten the equations of :func:`align`, for n spans."""
 
     pose: Float[Array, ""]
+    """Standard deviation of each pose's position, m, per axis."""
     speed: Float[Array, " n"]
+    """Standard deviation of the velocity gained over each span, m/s, per axis."""
     way: Float[Array, " n"]
-    """Of the way gained beyond that of the mean speed: this part is independent of the speed's error."""
+    """Standard deviation of the way gained over each span less that of the mean velocity, m, per axis. This
+    part is independent of the velocity's error."""
     accel_bias: Float[Array, ""]
+    """Prior standard deviation of the accelerometer's bias, m/s^2, per axis."""
 
 
 class Aligned(eqx.Module):
-    """The alignment's unknowns; its order is that of the columns."""
+    """The unknowns of :func:`align`, in the order of the least-squares problem's columns."""
 
     position: Float[Array, "k 3"]
+    """Position of the IMU at each of the k poses, m, in the world of the matched poses."""
     velocity: Float[Array, "k 3"]
+    """Velocity of the IMU at each of the k poses, m/s, in the world of the matched poses."""
     accel_share: Float[Array, "3"]
-    """Accelerometer bias over its prior sigma: a zero sigma freezes it."""
+    """Accelerometer's bias over its prior sigma, no unit, IMU frame: a zero sigma keeps the bias at zero."""
     gravity: Float[Array, "3"]
+    """Acceleration of gravity, m/s^2, in the world of the matched poses."""
 
 
 def gyro_bias_share(
@@ -60,12 +73,25 @@ def gyro_bias_share(
     initial: InitialParams,
     rotation_sigma: Float[Array, ""],
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"], Float[Array, ""]]:
-    """Return bias over its prior sigma, the bias's covariance and the squared misfit of the rotations."""
+    """Return the gyroscope's bias that makes n preintegrated rotations agree with n + 1 matched ones.
+
+    Args:
+        gain: preintegrated samples of the n spans, with the bias ``share`` times its prior sigma.
+        rotation: (k,) rotations R_world_imu of the k = n + 1 poses.
+        duration: length of each span, s.
+        share: gyroscope's bias over its prior sigma, as ``gain`` has it.
+        params: noise density of the gyroscope.
+        initial: prior sigma of the gyroscope's bias.
+        rotation_sigma: standard deviation of each pose's rotation, rad, per axis.
+
+    Returns:
+        The bias over its prior sigma, the bias's covariance ((rad/s)^2), and the whitened squared misfit.
+    """
     wxyz = rotation.wxyz
     turned = jax.vmap(lambda gained, a, b: (gained.inverse() @ a.inverse() @ b).log())(
         gain.rotation, jaxlie.SO3(wxyz[:-1]), jaxlie.SO3(wxyz[1:])
     )
-    # neighbouring spans share the error of the pose between them
+    # the errors of neighbouring spans are correlated: both contain the error of the pose between them
     spans = duration.shape[0]
     shared = 2 * jnp.eye(spans) - jnp.eye(spans, k=1) - jnp.eye(spans, k=-1)
     noise = jnp.diag(params.gyro_noise**2 * duration) + rotation_sigma**2 * shared
@@ -91,7 +117,21 @@ def align(
     gravity_strength: Float[Array, ""],
     scale: Scale,
 ) -> tuple[Aligned, Float[Array, "c c"], Float[Array, ""]]:
-    """Return velocities, gravity and accelerometer bias, their covariance and the squared misfit."""
+    """Return the positions, velocities, gravity and accelerometer's bias that agree with matched poses.
+
+    Args:
+        gain: preintegrated samples of the n spans between k = n + 1 poses.
+        T_near_imu: (k,) matched poses of the IMU.
+        matrices: rotation matrices of these poses.
+        duration: length of each span, s.
+        gravity_strength: magnitude of gravity, m/s^2.
+        scale: standard deviations of the equations.
+
+    Returns:
+        The solution in the world of the poses, its covariance, and the whitened squared misfit. The
+        covariance has c = 6 k + 5 columns, in the order of :class:`Aligned`; the last two are rotations of
+        gravity about :func:`axes_across`, rad.
+    """
     dt = duration[:, None]
     turn = matrices[:-1]
     matched = T_near_imu.translation()
@@ -143,7 +183,7 @@ def align(
 
 
 def axes_across(gravity: Float[Array, "3"]) -> Float[Array, "3 2"]:
-    """Return two unit axes normal to ``gravity``, whatever its direction."""
+    """Return two unit axes normal to ``gravity`` and to each other, for any direction of gravity."""
     up = gravity / jnp.linalg.norm(gravity)
     slanted = jnp.eye(3, dtype=up.dtype)[jnp.argmin(jnp.abs(up))]
     a = jnp.cross(up, slanted)
@@ -152,7 +192,7 @@ def axes_across(gravity: Float[Array, "3"]) -> Float[Array, "3 2"]:
 
 
 def _moved(x: Aligned, step: Float[Array, " c"], axes: Float[Array, "3 g"]) -> Aligned:
-    """Return the unknowns after a step, gravity's part given along ``axes``."""
+    """Return the unknowns after a step, whose last entries move gravity along ``axes``."""
     poses = x.position.size
     return Aligned(
         x.position + step[:poses].reshape(-1, 3),
@@ -165,36 +205,38 @@ def _moved(x: Aligned, step: Float[Array, " c"], axes: Float[Array, "3 g"]) -> A
 def _least_squares(
     misfit: Callable[[Float[Array, " c"]], Float[Array, " r"]], size: int, dtype: jnp.dtype
 ) -> tuple[Float[Array, " c"], Float[Array, "c c"]]:
-    """Return the step that solves a linear problem and the solution's covariance."""
+    """Return the step that solves a linear least-squares problem, and the solution's covariance."""
     zero = jnp.zeros(size, dtype)
-    # orthogonal factors, because the normal equations square a condition that is high already
+    # by QR, because the normal equations would square a condition number that is high already
     q, r = jnp.linalg.qr(jax.jacfwd(misfit)(zero))
     inverse = jax.scipy.linalg.solve_triangular(r, jnp.eye(size, dtype=dtype))
     return -(inverse @ (q.T @ misfit(zero))), inverse @ inverse.T
 
 
 GYRO_ROUNDS = 3
+"""Iterations of the gyroscope's bias; each preintegrates the samples anew."""
 MAX_RESIDUAL = 3.0
-"""Largest misfit, in standard deviations, with which poses and samples are taken to agree."""
+"""Largest misfit of a good start, in standard deviations."""
 MAX_TILT_SIGMA = 0.1
-"""Largest uncertainty of gravity's direction of a useful start, rad."""
+"""Largest standard deviation of gravity's direction of a good start, rad."""
 
 
 class MovingStart(eqx.Module):
     """A first navigation state at the last of the matched poses."""
 
     start: NavEstimate
-    """In a world with z up, origin and heading at the first IMU pose."""
+    """State and covariance at the last pose, in the level world: z is up, and the origin and the heading are
+    those of the first IMU pose."""
     T_level_world: jaxlie.SE3
-    """From the world of the matched poses to the level one: moves a map along."""
+    """Pose of the matched poses' world in the level world, m: it maps a map into the level world."""
     velocity: Float[Array, "k 3"]
-    """At each pose, in the level world, m/s."""
+    """Velocity of the IMU at each pose, m/s, in the level world."""
     residual: Float[Array, ""]
-    """Misfit of poses and samples in standard deviations; about 1 where noise is as stated."""
+    """Root mean square of the whitened misfit of poses and samples: about 1 where the noise is as stated."""
     tilt_sigma: Float[Array, ""]
     """Standard deviation of gravity's direction, rad."""
     is_good: Bool[Array, ""]
-    """Whether the start is to be relied on."""
+    """Whether the misfit and the uncertainty of gravity's direction are small enough to use the start."""
 
 
 def initialise_moving(
@@ -211,25 +253,26 @@ def initialise_moving(
 ) -> MovingStart:
     """Return the state at the last of n + 1 poses that agrees with the samples of the n spans between them.
 
-    The accelerometer bias follows weakly, as far as the vehicle turns; it is held near zero by its prior. Ten
-    poses over a second level a drive to the accelerometer bias over gravity.
+    The accelerometer's bias is weakly observable, and only as far as the vehicle turns; its prior keeps it
+    near zero. With ten poses over one second the error of the level is about the accelerometer's bias over
+    gravity.
 
     Args:
         imu: n batches (leading axis), each with the samples of its span.
-        start: of each span in its batch's time, s; the instant of pose i.
-        end: of each span, s; the instant of pose i + 1.
-        T_world_lidar: n + 1 poses of scan matching, any world.
-        params: noise densities and gravity.
-        initial: prior sigmas of the biases; zero keeps a bias at zero.
-        T_imu_lidar: extrinsic.
-        time_offset: of the lidar's clock, s.
-        rotation_sigma: of each pose, rad, per axis.
-        translation_sigma: of each pose, m, per axis.
+        start: start of each span in its batch's time, s: the instant of pose i.
+        end: end of each span in its batch's time, s: the instant of pose i + 1.
+        T_world_lidar: n + 1 poses of scan matching, in any world.
+        params: noise densities and the magnitude of gravity.
+        initial: prior sigmas; a zero sigma keeps a bias at zero.
+        T_imu_lidar: extrinsic pose of the lidar in the IMU frame.
+        time_offset: lag of the lidar's clock, s.
+        rotation_sigma: standard deviation of each pose's rotation, rad, per axis.
+        translation_sigma: standard deviation of each pose's position, m, per axis.
     """
     dtype = time_offset.dtype
     duration = jnp.maximum(end - start, 1e-4)
     last = T_world_lidar.translation()[-1]
-    # near the last pose, for single precision
+    # relative to the last pose's position: float32 is precise there
     near = jaxlie.SE3(T_world_lidar.wxyz_xyz.at[:, 4:].add(-last).astype(dtype))
     T_near_imu = jax.vmap(lambda pose: pose @ T_imu_lidar.inverse())(near)
     matrices = rotation_matrix(T_near_imu.rotation())
@@ -248,7 +291,7 @@ def initialise_moving(
         )
         return share, (gain, covariance, cost)
 
-    # loops of the compiled program: written out they compile for a minute
+    # loops inside the compiled program: unrolled they would take a minute to compile
     share, rounds = jax.lax.scan(round_of, jnp.zeros(3, dtype), None, GYRO_ROUNDS)
     gain, gyro_covariance, gyro_cost = jax.tree.map(lambda leaf: leaf[-1], rounds)
     scale = Scale(
@@ -306,7 +349,8 @@ def _error_covariance(
 ) -> Float[Array, "24 24"]:
     """Return the covariance of the error state in the level world, at the last pose.
 
-    A wrong gravity turns the level world: attitude, way and velocity in it are wrong by the same turn.
+    An error of gravity's direction turns the level world, so attitude, position and velocity in it are wrong
+    by the same rotation.
     """
     poses = solved.position.size
     axes = axes_across(solved.gravity)

@@ -12,21 +12,23 @@ from lio_jax.imu.sampling import Intervals
 
 
 class NoiseShares(eqx.Module):
-    """What each kind of noise adds to a preintegrated covariance: computed once, whatever the densities."""
+    """What each kind of noise adds to a preintegrated covariance, for any noise densities."""
 
     fixed: Float[Array, "*b 15 15"]
-    """What does not depend on the sensor: motion that no sample tells."""
+    """The part of motion that no sample measures; it does not depend on the sensor's noise."""
     per_variance: Float[Array, "*b 4 15 15"]
-    """Per squared density of gyroscope, accelerometer, gyroscope's and accelerometer's bias walk."""
+    """The parts per squared density of the gyroscope's noise, the accelerometer's noise, the gyroscope's bias
+    walk and the accelerometer's bias walk."""
 
     def covariance(self, params: ImuParams) -> Float[Array, "*b 15 15"]:
-        """Return the covariance with the sensor's densities."""
+        """Return the preintegrated covariance for the sensor's noise densities."""
         return self.fixed + jnp.einsum("k,...kij->...ij", _densities(params) ** 2, self.per_variance)
 
     def with_walk_apart(self) -> "NoiseShares":
-        """Return the shares as if the biases walked at the span's end only.
+        """Return the shares as if the biases changed at the span's end only.
 
-        A bias random walk that is a factor of its own, as in LIO-SAM's graph, has no part in the motion.
+        Use them where the bias random walk is a factor of its own, as in LIO-SAM's graph: it then has no
+        effect on the motion.
         """
         walks = jnp.zeros_like(self.per_variance[..., 2:, :, :])
         walks = walks.at[..., BIASES, BIASES].set(self.per_variance[..., 2:, BIASES, BIASES])
@@ -36,13 +38,13 @@ class NoiseShares(eqx.Module):
 def noise_shares(
     intervals: Intervals, gyro_bias: Float[Array, "3"], accel_bias: Float[Array, "3"], turning: bool = True
 ) -> NoiseShares:
-    """Return the shares of :func:`preintegrate`'s covariance; batches under vmap.
+    """Return the shares of :func:`~lio_jax.imu.preintegration.preintegrate`'s covariance.
 
     Args:
-        intervals: those of zero duration change nothing.
-        gyro_bias: rad/s.
-        accel_bias: m/s^2.
-        turning: as in :func:`preintegrate`.
+        intervals: measured motion; intervals of zero duration change nothing.
+        gyro_bias: rad/s, IMU frame.
+        accel_bias: m/s^2, IMU frame.
+        turning: as in :func:`~lio_jax.imu.preintegration.preintegrate`.
     """
 
     def covariance(densities: Float[Array, "4"]) -> Float[Array, "15 15"]:

@@ -16,28 +16,28 @@ from lio_jax.imu.rotation_integrals import SERIES_LIMIT, rotation_series
 class Path(eqx.Module):
     """Poses at k knots; between them the rate and the specific force in the IMU frame are constant.
 
-    Before the first and after the last knot the nearest interval's goes on.
+    Before the first knot and after the last one, the rate and the force are those of the nearest interval.
     """
 
     time: Float[Array, " k"]
-    """Not descending, s from the scan's start."""
+    """Time of each knot, s from the scan's start, not descending."""
     T_world_imu: jaxlie.SE3
-    """Pose at each knot."""
+    """Pose at each of the k knots, m."""
     velocity: Float[Array, "k 3"]
-    """In world, m/s."""
+    """Velocity of the IMU's origin at each knot, m/s, in world."""
     rate: Float[Array, "n 3"]
     """Angular rate in each of the k - 1 intervals, bias removed, rad/s, IMU frame."""
     accel: Float[Array, "n 3"]
     """Specific force in each of the k - 1 intervals, bias removed, m/s^2, IMU frame."""
     gravity: Float[Array, "3"]
-    """In world, m/s^2; zero where nothing was measured and the velocity is constant."""
+    """Acceleration of gravity, m/s^2, in world; zero where nothing was measured: the velocity is constant."""
 
 
 def pose_at(path: Path, time: Float[Array, " n"]) -> jaxlie.SE3:
     """Return T_world_imu at n instants, exact for the path's constant inputs.
 
     Args:
-        path: k knots; its dtype is the result's.
+        path: k knots; its dtype is that of the result.
         time: s from the scan's start.
     """
     interval = _interval_at(path.time, time)
@@ -53,8 +53,11 @@ def carry(path: Path, time: Float[Array, " n"], points: Float[Array, "n 3"]) -> 
 
     Args:
         path: k knots.
-        time: s from the scan's start.
-        points: m, each in the IMU frame of its own time.
+        time: time of each point, s from the scan's start.
+        points: m, each in the IMU frame at its own time.
+
+    Returns:
+        The points in world, m.
     """
     return _carried(_motion(path, jaxlie.SE3.identity()), time, points)
 
@@ -77,22 +80,24 @@ def deskew_along(
 
 
 _Triple = tuple[Array, Array, Array]
-"""The three components of n vectors: apart, because XLA's loops over (n, 3) compute each of them thrice."""
+"""The components x, y and z of n vectors. They are separate arrays, because XLA's loops over (n, 3) compute
+each component three times."""
 
 
 class _Motion(eqx.Module):
-    """The path of a body that is fixed to the IMU, in vectors of one frame."""
+    """The path of a body that is fixed to the IMU, as vectors in one frame."""
 
     time: Float[Array, " k"]
-    """Of the knots, s from the scan's start."""
+    """Time of each knot, s from the scan's start."""
     vectors: Float[Array, "n 8 3"]
-    """Of each of the k - 1 intervals: the body's axes x, y, z at its start, the body's origin from the IMU's
-    (m), angular rate (rad/s), specific force (m/s^2), the IMU's position (m) and velocity (m/s)."""
+    """Vectors at the start of each of the k - 1 intervals: the body's axes x, y and z, its origin from the
+    IMU's (m), angular rate (rad/s), specific force (m/s^2), the IMU's position (m) and velocity (m/s)."""
     gravity: Float[Array, "3"]
+    """Acceleration of gravity, m/s^2."""
 
 
 def _motion(path: Path, T_imu_body: jaxlie.SE3) -> _Motion:
-    """Return a path in world axes."""
+    """Return the motion of a body along the path, in world axes."""
     axes = jnp.swapaxes(rotation_matrix(path.T_world_imu.rotation()), 1, 2)[:-1]
     body = jnp.concatenate([rotation_matrix(T_imu_body.rotation()).T, T_imu_body.translation()[None]])
     held = jnp.broadcast_to(body, (len(axes), 4, 3))
@@ -102,7 +107,7 @@ def _motion(path: Path, T_imu_body: jaxlie.SE3) -> _Motion:
 
 
 def _seen_from(T_world_ref: jaxlie.SE3, motion: _Motion) -> _Motion:
-    """Return a motion that is given in world axes in those of the frame ``ref``, as from its origin."""
+    """Return a motion that is given in world in the frame ``ref`` instead."""
     R_world_ref = rotation_matrix(T_world_ref.rotation())
     moved = motion.vectors.at[:, 6].add(-T_world_ref.translation())
     return _Motion(motion.time, moved @ R_world_ref, motion.gravity @ R_world_ref)
@@ -113,20 +118,20 @@ def _interval_at(knots: Float[Array, " k"], time: Float[Array, " n"]) -> Int32[A
 
 
 def _carried(motion: _Motion, time: Float[Array, " n"], points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Return points of the body frame at their own times in the motion's frame.
+    """Return points, given in the body frame at their own times, in the motion's frame.
 
-    For w = h rate the turned point is p + a w x p + b w x (w x p), with p and the rate in the axes that the
-    motion is given in; of the same form is the second integral of the turning specific force.
+    With w = h rate the rotated point is p + a w x p + b w x (w x p), where p and the rate are in the axes of
+    the motion. The second integral of the rotating specific force has the same form.
     """
     interval = _interval_at(motion.time, time)
-    # one gather of whole rows
+    # a single gather of whole rows
     rows = motion.vectors.reshape(-1, 24)[interval]
     h = time.astype(rows.dtype) - motion.time[interval]
     x_axis, y_axis, z_axis, arm, rate, force, position, velocity = (_triple(rows, 3 * i) for i in range(8))
     x, y, z = points.T
     p = _each(lambda i: x * x_axis[i] + y * y_axis[i] + z * z_axis[i] + arm[i])
     w = _each(lambda i: h * rate[i])
-    # once, instead of once for each column
+    # computed once, and not for each column again
     a, b, c, d = computed_once(rotation_series(jnp.minimum(sum(x**2 for x in w), SERIES_LIMIT)))
     turned, pushed = _cross(w, p), _cross(w, force)
     twice, pushed_twice = _cross(w, turned), _cross(w, pushed)

@@ -15,26 +15,27 @@ from lio_jax.imu.sampling import Intervals
 
 
 class Preintegrated(eqx.Module):
-    """What the samples between two states say, whatever the first of them is."""
+    """The relative motion that samples between two states measure; it does not depend on the first state."""
 
     duration: Float[Array, ""]
-    """s."""
+    """Length of the span, s."""
     rotation: jaxlie.SO3
-    """IMU frame at the end to that at the start."""
+    """Rotation from the IMU frame at the end to that at the start."""
     position: Float[Array, "3"]
-    """Gained without gravity and initial velocity, m, first IMU frame."""
+    """Position gained without gravity and initial velocity, m, first IMU frame."""
     velocity: Float[Array, "3"]
-    """Gained without gravity, m/s, first IMU frame."""
+    """Velocity gained without gravity, m/s, first IMU frame."""
     gyro_bias: Float[Array, "3"]
-    """Subtracted from the samples, rad/s."""
+    """Bias subtracted from the angular rates, rad/s, IMU frame."""
     accel_bias: Float[Array, "3"]
-    """Subtracted from the samples, m/s^2."""
+    """Bias subtracted from the specific forces, m/s^2, IMU frame."""
     bias_jacobian: Float[Array, "9 6"]
-    """Of rotation, position, velocity (right perturbation, last frame) by gyro and accelerometer bias."""
+    """Derivative of rotation (rad), position (m) and velocity (m/s), as a right perturbation in the last IMU
+    frame, by the gyroscope's bias (rad/s) and the accelerometer's bias (m/s^2)."""
     covariance: Float[Array, "15 15"]
-    """Of rotation, position, velocity (same), and the drift of gyro and accelerometer bias."""
+    """Covariance of the same rotation, position and velocity, and of the change of both biases."""
     measured: Bool[Array, ""]
-    """False where there were no samples: the velocity is then constant and gravity has no part."""
+    """False where there were no samples: the velocity is then constant, and gravity has no effect."""
 
 
 def preintegrate(
@@ -44,20 +45,20 @@ def preintegrate(
     params: ImuParams,
     turning: bool = True,
 ) -> Preintegrated:
-    """Preintegrate intervals one after the other, by ``jax.lax.scan``; batches under vmap.
+    """Preintegrate intervals one after the other, by ``jax.lax.scan``.
 
-    With ``turning`` the specific force is constant in the turning body's frame, which is exact for constant
-    inputs; without, it is constant in the frame of each interval's start, as in Forster et al. Deltas,
-    covariances and bias Jacobians equal gtsam's PreintegratedImuMeasurementsG and
-    PreintegratedImuMeasurementsManifold respectively (gtsam's default formulation, in the tangent space,
-    approximates the same integrals to first order).
+    With ``turning`` the specific force is constant in the turning IMU frame, which is exact for constant
+    inputs. Without it the force is constant in the IMU frame of each interval's start, as in Forster et al.
+    Deltas, covariances and bias Jacobians equal those of gtsam's PreintegratedImuMeasurementsG and
+    PreintegratedImuMeasurementsManifold, respectively. (gtsam's default formulation, in the tangent space,
+    approximates the same integrals to first order.)
 
     Args:
-        intervals: those of zero duration change nothing.
-        gyro_bias: rad/s.
-        accel_bias: m/s^2.
+        intervals: measured motion; intervals of zero duration change nothing.
+        gyro_bias: subtracted from the angular rates, rad/s, IMU frame.
+        accel_bias: subtracted from the specific forces, m/s^2, IMU frame.
         params: noise densities.
-        turning: see above.
+        turning: which frame holds the specific force, see above.
     """
 
     def single(piece: Intervals) -> Preintegrated:
@@ -78,10 +79,10 @@ def preintegrate_parallel(
     params: ImuParams,
     turning: bool = True,
 ) -> Preintegrated:
-    """Return :func:`preintegrate` by prefix sums and an associative scan over the rotations.
+    """Return the result of :func:`preintegrate`, by prefix sums and an associative scan over the rotations.
 
-    Measured on two CPU cores in float64, 20, 100 and 400 intervals, one span: 0.2, 0.3 and 1.0 ms, where the
-    scan takes 0.3, 0.8 and 3.1 ms. Not measured on a GPU.
+    One span of 20, 100 and 400 intervals takes 0.2, 0.3 and 1.0 ms on two CPU cores in float64;
+    :func:`preintegrate` takes 0.3, 0.8 and 3.1 ms. The times on a GPU were not measured.
     """
     measured = intervals.measured
     rate = jnp.where(measured, intervals.gyro - gyro_bias, 0.0)
@@ -104,9 +105,9 @@ def preintegrate_parallel(
 
 
 def compose(first: Preintegrated, second: Preintegrated) -> Preintegrated:
-    """Return the preintegration over both spans, the second of which begins where the first ends.
+    """Return the preintegration over two spans, the second of which begins where the first ends.
 
-    Both must have been made with the same biases; associative.
+    Both must have been made with the same biases. The operation is associative.
     """
     carry = nav_transition(second.rotation, second.velocity, second.position, second.duration)
     jacobian = carry @ first.bias_jacobian + second.bias_jacobian
@@ -130,7 +131,13 @@ def compose(first: Preintegrated, second: Preintegrated) -> Preintegrated:
 def correct_bias(
     preintegrated: Preintegrated, gyro_bias: Float[Array, "3"], accel_bias: Float[Array, "3"]
 ) -> Preintegrated:
-    """Return the increments for other biases, to first order; Jacobian and covariance stay."""
+    """Return the increments for other biases, to first order; the Jacobian and the covariance do not change.
+
+    Args:
+        preintegrated: increments with their own biases.
+        gyro_bias: rad/s, IMU frame.
+        accel_bias: m/s^2, IMU frame.
+    """
     change = jnp.concatenate([gyro_bias - preintegrated.gyro_bias, accel_bias - preintegrated.accel_bias])
     error = preintegrated.bias_jacobian @ change
     rotation = preintegrated.rotation
@@ -148,7 +155,7 @@ def correct_bias(
 
 
 def predict(preintegrated: Preintegrated, nav: NavState) -> NavState:
-    """Return the state at the end of the span that began in ``nav``, with ``nav``'s biases and gravity."""
+    """Return the state at the end of a span that began in ``nav``, with ``nav``'s biases and gravity."""
     gained = correct_bias(preintegrated, nav.gyro_bias, nav.accel_bias)
     elapsed = gained.duration
     gravity = jnp.where(gained.measured, nav.gravity, 0.0)

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from lio_jax.core.geometry import skew
 
 SERIES_LIMIT = 40.0
-"""Square of the angle, rad^2, up to which the power series holds to float32's precision."""
+"""Square of the angle, rad^2, up to which the power series has float32's precision."""
 _SERIES_BELOW = 4.0
-"""Square of the angle, rad^2, up to which it holds to float64's."""
+"""Square of the angle, rad^2, up to which the power series has float64's precision."""
 _TERMS = 12
 _FACTORIALS = np.array([math.factorial(n) for n in range(2 * _TERMS + 5)], float)
 
@@ -22,7 +22,7 @@ _FACTORIALS = np.array([math.factorial(n) for n in range(2 * _TERMS + 5)], float
 def rotation_coefficients(angle_squared: Float[Array, "*b"]) -> Float[Array, "*b 6"]:
     """Return s_n, the sum over k of (-t^2)^k / (2k+n)!, for n from 1 to 6.
 
-    The first are a = sin(t)/t, b = (1-cos(t))/t^2, c = (t-sin(t))/t^3 and d = (t^2/2-1+cos(t))/t^4.
+    The first four are a = sin(t)/t, b = (1-cos(t))/t^2, c = (t-sin(t))/t^3 and d = (t^2/2-1+cos(t))/t^4.
 
     With them, for phi = t * axis and X the cross product with phi: Exp(phi) = I + a X + b X^2, its integral
     over the unit interval I + b X + c X^2, and the integral of that I/2 + c X + d X^2. The derivative of
@@ -44,10 +44,10 @@ def rotation_coefficients(angle_squared: Float[Array, "*b"]) -> Float[Array, "*b
 
 
 def rotation_series(angle_squared: Float[Array, " n"]) -> Float[Array, "4 n"]:
-    """Return the first four of :func:`rotation_coefficients` up to ``SERIES_LIMIT``, cheap in batches.
+    """Return the first four of :func:`rotation_coefficients` by their series, which is cheap in batches.
 
     Args:
-        angle_squared: rad^2.
+        angle_squared: rad^2, at most ``SERIES_LIMIT``.
     """
     return _series(angle_squared, np.arange(1, 5)[:, None])
 
@@ -61,7 +61,7 @@ def _series(x: Float[Array, "*b"], order: NDArray[np.intp]) -> Array:
 
 
 def rotation_exponential(rotvec: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
-    """Return the matrix Exp(rotvec) of a rotation vector, rad; it shares its terms with the integrals."""
+    """Return the rotation matrix Exp(rotvec) of a rotation vector, rad, from the terms of the integrals."""
     a, b, *_ = _coefficients(rotvec)
     cross = skew(rotvec)
     return jnp.eye(3, dtype=rotvec.dtype) + a * cross + b * (cross @ cross)
@@ -70,7 +70,7 @@ def rotation_exponential(rotvec: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]
 def rotation_integrals(rotvec: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3 3"], Float[Array, "*b 3 3"]]:
     """Return the first and second integral of Exp(s rotvec) over s from 0 to 1.
 
-    The first is the left Jacobian of SO(3); a body that turns by ``rotvec`` in h seconds under a constant
+    The first is the left Jacobian of SO(3). A body that turns by ``rotvec`` in h seconds under a constant
     specific force f gains the velocity h * first @ f and the way h^2 * second @ f, in its frame at the start
     (Bloesch et al., "State estimation for legged robots", RSS 2012).
 
@@ -87,7 +87,12 @@ def rotation_integrals(rotvec: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3
 def integral_derivatives(
     rotvec: Float[Array, "*b 3"], vector: Float[Array, "*b 3"]
 ) -> tuple[Float[Array, "*b 3 3"], Float[Array, "*b 3 3"]]:
-    """Return the derivatives by ``rotvec`` of ``vector`` under both :func:`rotation_integrals`."""
+    """Return the derivatives of ``first @ vector`` and ``second @ vector`` with respect to ``rotvec``.
+
+    Args:
+        rotvec: rad.
+        vector: multiplied by both :func:`rotation_integrals` of ``rotvec``.
+    """
     _, b, c, d, e, f = _coefficients(rotvec)
     cross = skew(rotvec)
     once = (cross @ vector[..., None])[..., 0]

@@ -1,4 +1,4 @@
-"""From a padded batch of inertial samples to intervals that cover a span of time exactly."""
+"""Cut a padded batch of inertial samples into intervals that cover a span of time exactly."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -7,14 +7,15 @@ from jaxtyping import Array, Bool, Float
 from lio_jax.core.types import ImuBatch
 
 LONGEST_GAP = 0.15
-"""Between samples farther apart than this, s, the motion counts as unknown; nor is a sample held longer."""
+"""Longest time between two samples, s, for which the motion between them counts as known. The first and the
+last sample are held for at most this long."""
 
 
 class Intervals(eqx.Module):
     """Consecutive intervals, in each of which the measured rate and specific force are constant."""
 
     duration: Float[Array, " n"]
-    """s; 0 on padding."""
+    """Length of each interval, s; 0 on padding."""
     gyro: Float[Array, "n 3"]
     """Mean measured angular rate, rad/s, IMU frame."""
     accel: Float[Array, "n 3"]
@@ -22,29 +23,29 @@ class Intervals(eqx.Module):
     gap: Float[Array, " n"]
     """Time between the two samples around each interval, s."""
     known: Bool[Array, " n"]
-    """False where the samples are too far away to tell the motion."""
+    """False where the samples around an interval are too far apart, so that its motion is unknown."""
     measured: Bool[Array, ""]
-    """False where there is no sample near the whole span: rates and forces are then zero."""
+    """False where no sample is near the span: all rates and forces are then zero."""
 
 
 def sample_intervals(
     imu: ImuBatch, time_offset: Float[Array, ""], start: Float[Array, ""], end: Float[Array, ""]
 ) -> Intervals:
-    """Cut the span from ``start`` to ``end`` at the samples and take the mean of each piece's two ends.
+    """Cut the span from ``start`` to ``end`` at the samples; an interval has the mean of its two ends.
 
-    The signal is linear between samples, so it is interpolated at the span's ends, and the first and the last
-    sample are held. A sample stamped t by the IMU was taken at t - time_offset on the lidar's clock. Samples
-    may be in any order; those that are masked or not finite are left out. Without any, all intervals are zero
-    and not measured.
+    The signal is linear between samples and is interpolated at the span's ends. Before the first sample and
+    after the last one it is constant. A sample stamped t by the IMU was taken at t - time_offset on the
+    lidar's clock. Samples may be in any order. Those that are masked or not finite are left out. Without any
+    sample all rates and forces are zero and not measured.
 
     Args:
         imu: m samples.
         time_offset: lag of the lidar's clock, s.
-        start: s, same origin as the samples' times.
-        end: s, not before ``start``.
+        start: on the lidar's clock, s, from the same origin as the samples' times.
+        end: on the lidar's clock, s, not before ``start``.
 
     Returns:
-        m + 1 intervals, those outside the span with zero duration.
+        m + 1 intervals; those outside the span have zero duration.
     """
     dtype = time_offset.dtype
     samples = jnp.concatenate([imu.time[:, None], imu.gyro, imu.accel], axis=1).astype(dtype)

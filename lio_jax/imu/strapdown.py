@@ -39,7 +39,7 @@ def propagate(
     start: Float[Array, ""],
     end: Float[Array, ""],
 ) -> tuple[NavEstimate, Path]:
-    """Carry a state from ``start`` to ``end`` as :func:`propagate_sweep` does, without a sweep."""
+    """Propagate a state from ``start`` to ``end`` as :func:`propagate_sweep` does, without a sweep."""
     swept, path = propagate_sweep(state, imu, params, start, end, end)
     return swept.at_end(), path
 
@@ -52,22 +52,23 @@ def propagate_sweep(
     end: Float[Array, ""],
     sweep_start: Float[Array, ""],
 ) -> tuple[SweptState, Path]:
-    """Carry a state from ``start`` to ``end`` along the inertial samples, with its covariance.
+    """Propagate a state and its covariance from ``start`` to ``end`` along the inertial samples.
 
-    The samples are sampled as :func:`lio_jax.imu.sampling.sample_intervals` says, at the lidar's clock. Where
-    no sample is near the whole span, the velocity stays constant and the rate is zero; there, and in long
-    gaps, the noise is that of an unknown motion (:mod:`lio_jax.imu.discretise`).
+    :func:`lio_jax.imu.sampling.sample_intervals` makes intervals of the samples. Where no sample is near the
+    span, the velocity stays constant and the rate is zero. There, and in long gaps between samples, the noise
+    is that of an unknown motion (:mod:`lio_jax.imu.discretise`).
 
     Args:
         state: at ``start``.
         imu: samples from the last one before ``start`` to the first one after ``end``.
         params: noise densities.
-        start: usually the last scan's end, s from this scan's start.
+        start: usually the previous scan's end, s from this scan's start.
         end: s from this scan's start, not before ``start``.
-        sweep_start: time of the sweep's first point, s from this scan's start; its last is at ``end``.
+        sweep_start: time of the sweep's first point, s from this scan's start. The last point is at ``end``.
 
     Returns:
-        The state at ``end`` and how it differs from the sweep's mean, and the motion in between.
+        The state at ``end``, with the covariance of its error and of the error's difference from its mean
+        over the sweep; and the path from ``start`` to ``end``.
     """
     nav = state.nav
     intervals, shift = jax.jvp(
@@ -97,12 +98,19 @@ def propagate_sweep(
 
 
 def path_along(nav: NavState, imu: ImuBatch, start: Float[Array, ""], end: Float[Array, ""]) -> Path:
-    """Return the motion from ``start`` to ``end`` alone, as :func:`propagate` does."""
+    """Return the path from ``start`` to ``end`` that :func:`propagate` returns, without a covariance.
+
+    Args:
+        nav: at ``start``.
+        imu: samples from the last one before ``start`` to the first one after ``end``.
+        start: on the lidar's clock, s, from the same origin as the samples' times.
+        end: on the lidar's clock, s, not before ``start``.
+    """
     return _follow(nav, sample_intervals(imu, nav.time_offset, start, end), start)[1]
 
 
 def _follow(nav: NavState, intervals: Intervals, start: Float[Array, ""]) -> tuple[Increments, Path]:
-    # constant velocity where nothing is measured: gravity must not act either
+    # constant velocity where nothing is measured, so gravity must have no effect either
     measured = intervals.measured
     rate = jnp.where(measured, intervals.gyro - nav.gyro_bias, 0.0)
     accel = jnp.where(measured, intervals.accel - nav.accel_bias, 0.0)
@@ -133,15 +141,15 @@ def _transition(
     by_offset: Float[Array, "15"],
     to_show: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]],
 ) -> Float[Array, "30 24"]:
-    """Return the derivative of the error at the end, and of the lag, by the error at the start.
+    """Return the derivative of the error at the end, and of ``LAG``, by the error at the start.
 
     Args:
         nav: at the start.
-        increments: since then.
-        gravity: m/s^2, zero where nothing is measured.
-        by_bias: derivative of rotation, position and velocity at the end and of the lag.
-        by_offset: the same by the time offset.
-        to_show: for the start, as :func:`still_to_show` returns it.
+        increments: motion since the start.
+        gravity: m/s^2, in world; zero where nothing is measured.
+        by_bias: derivative of rotation, position and velocity at the end, and of ``LAG``, by the biases.
+        by_offset: derivative of the same quantities by the time offset.
+        to_show: what :func:`still_to_show` returns for the start.
     """
     elapsed = increments.time[-1]
     turned = jaxlie.SO3(increments.rotation.wxyz[-1])
@@ -169,7 +177,7 @@ def _transition(
 
 
 def _placed(noise: Float[Array, "21 21"]) -> Float[Array, "30 30"]:
-    """Return the covariance of navigation state, lag and biases at their places in the error."""
+    """Return a covariance of motion, ``LAG`` and biases with its entries at their places in the error."""
     places = (slice(0, NAV_DOF), LAG, BIASES)
     parts = (slice(0, NAV_DOF), slice(NAV_DOF, NAV_DOF + LAG_DOF), slice(NAV_DOF + LAG_DOF, None))
     pairs = tuple(zip(places, parts, strict=True))

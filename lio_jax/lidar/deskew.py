@@ -9,12 +9,12 @@ def deskew_constant_velocity(
 ) -> Float[Array, "n 3"]:
     """Move points measured ``delay`` seconds after an instant into the sensor frame of that instant.
 
-    p' = exp(delay * twist) p, the SE(3) exponential in closed form (Rodrigues), in the points' dtype, without
-    a quaternion per point.
+    The result is p' = exp(delay * twist) p. The SE(3) exponential is in closed form (Rodrigues), in the
+    points' dtype, without a quaternion for each point.
 
     Args:
-        points: m, sensor frame at each point's own firing time.
-        delay: firing time minus the instant, s; negative before it.
+        points: m, sensor frame at the firing time of each point.
+        delay: firing time minus the instant, s; negative for points before the instant.
         twist: velocity of the sensor in its own frame, translation (m/s) first, then rotation (rad/s).
     """
     velocity, rate = twist[:3].astype(points.dtype), twist[3:].astype(points.dtype)

@@ -1,9 +1,10 @@
 """Corners and flat points along the rings of a scan: the front ends of LOAM and LIO-SAM.
 
     scan -> range image -> smoothness, masks -> picks, sector by sector -> corners, flat points
-                                                   \\-> what is no corner -> mean per ring and voxel
+                                                   \\-> all other points -> mean per ring and voxel
 
-Indices carry no gradient; the points they gather, and the means, do.
+The indices have no derivative. The points that they gather, and the means, have one. The clouds can be
+thinned further for a map, by the mean per voxel.
 """
 
 import dataclasses
@@ -37,54 +38,61 @@ class FeatureCloud(eqx.Module):
     """Points of one kind, padded to n."""
 
     points: Float[Array, "n 3"]
-    """m, lidar frame at each point's own firing time."""
+    """Coordinates in the lidar frame at the firing time of each point, m."""
     time: Float[Array, " n"]
     """Firing time from the scan's start, s."""
     ring: Int32[Array, " n"]
+    """Beam index; 0 where the cloud has no rings."""
     mask: Bool[Array, " n"]
+    """True where a point is real, False on padding."""
 
 
 class LoamFeatures(eqx.Module):
-    """What A-LOAM's scan registration hands on."""
+    """The result of A-LOAM's scan registration."""
 
     sharp: FeatureCloud
+    """The sharpest corners of each sector."""
     less_sharp: FeatureCloud
-    """The sharp ones included."""
+    """More corners of each sector, those of ``sharp`` included."""
     flat: FeatureCloud
+    """The flattest points of each sector."""
     less_flat: FeatureCloud
-    """All points that are not less sharp, averaged per ring and voxel."""
+    """All points that are not in ``less_sharp``, averaged per ring and voxel."""
     dropped: Int32[Array, ""]
-    """Points, and rows of ``less_flat``, that found no room in the capacities."""
+    """Number of points, and of rows of ``less_flat``, beyond the capacities."""
 
 
 class LioSamFeatures(eqx.Module):
-    """What LIO-SAM's feature extraction hands on."""
+    """The result of LIO-SAM's feature extraction."""
 
     corner: FeatureCloud
+    """The sharpest points of each sector."""
     surface: FeatureCloud
     """All points that are not corners, averaged per ring and voxel."""
     dropped: Int32[Array, ""]
-    """Points, and rows of ``surface``, that found no room in the capacities."""
+    """Number of points, and of rows of ``surface``, beyond the capacities."""
 
 
 class Rings(eqx.Module):
-    """A scan along its rings, and what is known about each point there."""
+    """A scan along its rings, with the smoothness and the masks of its points."""
 
     image: RangeImage
+    """Which point of the scan is at each place along the rings."""
     xyz: tuple[Float32[Array, "k rings"], Float32[Array, "k rings"], Float32[Array, "k rings"]]
-    """m; zero where there is no point."""
+    """Coordinates x, y and z in the lidar frame, m; zero where there is no point."""
     time: Float32[Array, "k rings"]
-    """s."""
+    """Firing time from the scan's start, s; zero where there is no point."""
     ring: Ring
+    """Smoothness of each point, and which points may be picked."""
     bounds: Int32[Array, "bounds rings"]
-    """Of the sectors."""
+    """Place along each ring where each sector starts, and where the last one ends."""
 
 
 def check_sizes(config: Config) -> None:
-    """Refuse sizes of ``config.features`` that are still to be chosen by the recording.
+    """Check that no size of ``config.features`` is left to be chosen from the recording.
 
     Raises:
-        UsageError: one of them is 0.
+        UsageError: the number of rings, columns or surface points is 0.
     """
     features = config.features
     if not (features.rings and features.columns and features.surface_points):
@@ -97,7 +105,8 @@ def check_sizes(config: Config) -> None:
 def loam_features(config: Config, params: Params, scan: Scan) -> LoamFeatures:
     """Pick LOAM's features.
 
-    Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014, section V.A, in A-LOAM's form.
+    Source: Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014, section V.A, in the form
+    of A-LOAM.
 
     Args:
         config: ``config.features``.
@@ -119,8 +128,9 @@ def loam_features(config: Config, params: Params, scan: Scan) -> LoamFeatures:
 def lio_sam_features(config: Config, params: Params, scan: Scan) -> LioSamFeatures:
     """Pick LIO-SAM's features.
 
-    Shan et al., "LIO-SAM: Tightly-coupled lidar inertial odometry via smoothing and mapping", IROS 2020,
-    section III.C, as its program does it: flat points only keep corners away from themselves.
+    Source: Shan et al., "LIO-SAM: Tightly-coupled lidar inertial odometry via smoothing and mapping", IROS
+    2020, section III.C, in the form of its program: flat points are picked, but they only suppress corners
+    near them.
 
     Args:
         config: ``config.features``, with ``order="azimuth"`` unless the rings are the lines of a Livox.
@@ -138,8 +148,13 @@ def lio_sam_features(config: Config, params: Params, scan: Scan) -> LioSamFeatur
 def loam_rings(config: Config, params: Params, scan: Scan) -> Rings:
     """Return the scan's rings with the smoothness of the points in 3-D; every point may be picked.
 
-    Suppression ends where points that follow each other are farther apart than ``connected_distance``, in
-    place of the paper's tests for occlusion and for surfaces along the beam.
+    Suppression ends where consecutive points are farther apart than ``connected_distance``. This replaces the
+    paper's tests for occlusion and for surfaces along the beam.
+
+    Args:
+        config: ``config.features``.
+        params: ``params.features`` and the range limits of ``params.lidar``.
+        scan: padded sweep.
     """
     image, xyz, time = _gathered(config, params, scan)
     with jax.named_scope("smoothness"):
@@ -150,7 +165,13 @@ def loam_rings(config: Config, params: Params, scan: Scan) -> Rings:
 
 
 def lio_sam_rings(config: Config, params: Params, scan: Scan) -> Rings:
-    """Return the scan's rings with the smoothness of the ranges, without hidden and grazed points."""
+    """Return the scan's rings with the smoothness of the ranges, without occluded and grazing points.
+
+    Args:
+        config: ``config.features``.
+        params: ``params.features`` and the range limits of ``params.lidar``.
+        scan: padded sweep.
+    """
     image, xyz, time = _gathered(config, params, scan)
     limits, neighbours = params.features, config.features.neighbours
     with jax.named_scope("smoothness"):
@@ -174,7 +195,7 @@ def lio_sam_rings(config: Config, params: Params, scan: Scan) -> Rings:
 def _gathered(
     config: Config, params: Params, scan: Scan
 ) -> tuple[RangeImage, tuple[Array, Array, Array], Array]:
-    """Return the range image, and x, y, z and the time along its rings."""
+    """Return the range image, the coordinates x, y and z along its rings (m), and the times (s)."""
     with jax.named_scope("range_image"):
         image = range_image(config.features, params, scan)
         x, y, z, time = (
@@ -213,7 +234,7 @@ def _picked(config: Config, params: Params, rings: Rings, flats: int | None) -> 
 
 
 def _cloud(scan: Scan, rings: Rings, places: Int32[Array, "c sectors rings"]) -> FeatureCloud:
-    """Return the points at places along the rings."""
+    """Return the points at the given places along the rings; a place of -1 is masked."""
     number = jnp.broadcast_to(jnp.arange(places.shape[-1], dtype=jnp.int32), places.shape)
     mask = (places >= 0).ravel()
     index = rings.image.index[jnp.maximum(places, 0), number].ravel()
@@ -228,7 +249,7 @@ def _cloud(scan: Scan, rings: Rings, places: Int32[Array, "c sectors rings"]) ->
 def _surface(
     config: Config, params: Params, rings: Rings, picks: Picks
 ) -> tuple[FeatureCloud, Int32[Array, ""]]:
-    """Return what lies in a sector and is no corner, averaged per ring and voxel, and the rows left out."""
+    """Return the mean per ring and voxel of the sectors' points that are no corners, and the dropped rows."""
     k, count = rings.time.shape
     with jax.named_scope("surface"):
         number = jnp.arange(count, dtype=jnp.int32)
@@ -249,7 +270,14 @@ _Features = TypeVar("_Features")
 def in_single_precision(
     pick: Callable[[Config, Params, Scan], _Features], config: Config, params: Params, scan: Scan
 ) -> _Features:
-    """Pick features in single precision, since which ones has no derivative; return them in the scan's."""
+    """Pick features in single precision, and return them in the scan's dtype: the choice has no derivative.
+
+    Args:
+        pick: one of :func:`loam_features` and :func:`lio_sam_features`.
+        config: ``config.features``.
+        params: ``params.features`` and the range limits of ``params.lidar``.
+        scan: padded sweep.
+    """
     dtype = scan.points.dtype
     single = dataclasses.replace(
         scan, points=scan.points.astype(jnp.float32), time=scan.time.astype(jnp.float32)
@@ -261,17 +289,17 @@ def in_single_precision(
 def thinned_features(
     corner: FeatureCloud, surface: FeatureCloud, params: Params, corners: int, surfaces: int
 ) -> tuple[FeatureCloud, FeatureCloud, Int32[Array, ""]]:
-    """Return the means per voxel of the map, and how many found no room.
+    """Return the means of corners and of surface points per voxel of the map, and how many were dropped.
 
-    They are averaged before the motion is compensated and not after it, so that the groups do not depend on
-    the motion: points as near to each other as these are moved alike.
+    The points are averaged before motion compensation, so that the groups do not depend on the motion.
+    Compensation moves the points of one voxel almost equally.
 
     Args:
-        corner: of a scan.
-        surface: of a scan.
-        params: voxel sizes.
-        corners: capacity.
-        surfaces: capacity.
+        corner: corners of a scan.
+        surface: surface points of a scan.
+        params: ``map.corner_voxel_size`` and ``map.voxel_size``.
+        corners: capacity for corners.
+        surfaces: capacity for surface points.
     """
     kinds = ((corner, params.map.corner_voxel_size, corners), (surface, params.map.voxel_size, surfaces))
     clouds, dropped = [], jnp.int32(0)

@@ -1,14 +1,15 @@
-"""Pick the sharpest and the flattest points of each sector of each ring, as the sequential rule does.
+"""Pick the sharpest and the flattest points of each sector of each ring, by the sequential rule.
 
-Zhang & Singh, RSS 2014, sections V.A and V.B, in the form of A-LOAM and LIO-SAM: a ring is cut into sectors,
-visited one after another. In each, points are visited by descending smoothness for corners and then by
-ascending smoothness for flat ones; a pick suppresses its neighbours on both sides, across the sector's end
-as well. Equal values are ordered by their place along the ring (a stable ascending sort, read from its end
-for corners).
+The rule is that of Zhang & Singh, RSS 2014, sections V.A and V.B, in the form of A-LOAM and LIO-SAM. A ring
+is cut into sectors, which are visited one after another. In each sector, points are visited by descending
+smoothness for corners, and then by ascending smoothness for flat points. A pick suppresses its neighbours on
+both sides, also across the sector's end. Equal values are ordered by their place along the ring (a stable
+ascending sort, read from its end for corners).
 
-Rings do not touch each other, so the rule runs on all rings at once: one pick a turn is the sector's maximum.
-Sectors do, so they follow one another. On a CPU a turn over 64 rings takes 10 us: an argmax, or rings as rows
-of the array, take twice as long, and picking all local extremes at once until none is left no less in all.
+Rings are independent, so the rule runs on all rings at once: each turn picks the maximum of every ring's
+sector. Sectors are not independent, so they follow one another. On a CPU a turn over 64 rings takes 10 us. An
+argmax, or rings as rows of the array, takes twice as long. To pick all local extremes at once, until none is
+left, is not faster in total.
 """
 
 import equinox as eqx
@@ -19,29 +20,31 @@ from jaxtyping import Array, Bool, Float32, Int32
 from lio_jax.core.xla import computed_once
 
 _CLOSED = -1
-"""Key of a point that can't be picked any more; open points have non-negative keys."""
+"""Key of a point that cannot be picked any more; the keys of open points are not negative."""
 
 
 class Picks(eqx.Module):
-    """Places along the rings, -1 where there is none, in the order in which they were picked."""
+    """Picked places along the rings, in the order of picking; -1 where there is none."""
 
     corners: Int32[Array, "c sectors rings"]
+    """Places of the corners, up to c in each sector."""
     flats: Int32[Array, "f sectors rings"]
+    """Places of the flat points, up to f in each sector."""
 
 
 class Ring(eqx.Module):
-    """What the selection knows about the points along each ring."""
+    """The input of the selection for the k places along each ring."""
 
     smoothness: Float32[Array, "k rings"]
-    """m^2."""
+    """Smoothness of each point, m^2: large at corners."""
     open: Bool[Array, "k rings"]
-    """Which points may be picked."""
+    """True where a point may be picked."""
     before: Int32[Array, "k rings"]
-    """How many points before a pick it suppresses ..."""
+    """Number of points before a pick that it suppresses."""
     after: Int32[Array, "k rings"]
-    """... and how many after it."""
+    """Number of points after a pick that it suppresses."""
     neighbours: int = eqx.field(static=True)
-    """Bound of ``before`` and ``after``."""
+    """Upper bound of ``before`` and ``after``."""
 
 
 def sector_bounds(count: Int32[Array, " rings"], sectors: int, unused: int) -> Int32[Array, "bounds rings"]:
@@ -68,12 +71,12 @@ def pick(
     """Pick corners and flat points sector by sector.
 
     Args:
-        ring: along each ring.
-        bounds: of the sectors, see :func:`sector_bounds`.
-        corner_threshold: corners are sharper than this, m^2.
-        flat_threshold: flat points are less sharp than this, m^2.
-        corners: per sector at most.
-        flats: per sector at most; None: as many as there are.
+        ring: smoothness and suppression of the points along each ring.
+        bounds: starts of the sectors, see :func:`sector_bounds`.
+        corner_threshold: smoothness above which a point may be a corner, m^2.
+        flat_threshold: smoothness below which a point may be a flat point, m^2.
+        corners: largest number of corners in a sector.
+        flats: largest number of flat points in a sector; None: no limit.
     """
     k, rings = ring.smoothness.shape
     width = -(-k // (bounds.shape[0] - 1))
@@ -110,9 +113,11 @@ class _Turns(eqx.Module):
     start: Int32[Array, " rings"]
     """Place of the sector's first row along the ring."""
     row: Int32[Array, "w 1"]
+    """Number of each row, from 0."""
     reach: Int32[Array, "w rings"]
-    """``before << bits | after`` of a pick."""
+    """Suppression of a pick at each row, packed as ``before << bits | after``."""
     bits: int = eqx.field(static=True)
+    """Number of bits of ``before`` and of ``after``."""
 
     def run(
         self,
@@ -122,18 +127,18 @@ class _Turns(eqx.Module):
         limit: int,
         later_first: bool,
     ) -> tuple[Int32[Array, "w rings"], Int32[Array, "limit rings"], Int32[Array, " rings"]]:
-        """Return the keys that are left, the places of the picks, and the first place none suppresses.
+        """Return the remaining keys, the places of the picks, and the first place that no pick suppresses.
 
         Args:
-            keys: one is picked if it is the largest and larger than ``above``.
+            keys: the largest key of a ring is picked if it exceeds ``above``.
             free: first place of each ring that earlier picks do not suppress.
             above: see ``keys``.
-            limit: number of picks at most.
-            later_first: which of equal keys comes first.
+            limit: largest number of picks.
+            later_first: True: the last of equal keys is picked first. False: the first of them.
         """
         bits, last = self.bits, self.row.shape[0] - 1
-        # row, before and after in one number: a single maximum finds them all, where a gather by the row
-        # would be spread over threads that take longer to wake than the work takes
+        # row, before and after in one number: a single maximum finds them all. A gather by the row would be
+        # spread over threads, and waking them takes longer than the work
         ticket = (self.row if later_first else last - self.row) << 2 * bits | self.reach
 
         def more(turn: tuple[Array, ...]) -> Array:
@@ -141,7 +146,7 @@ class _Turns(eqx.Module):
 
         def one(turn: tuple[Array, ...]) -> tuple[Array, ...]:
             done, keys, picks, free, _ = turn
-            # in memory of its own: a loop that reads what it carries is not vectorised
+            # a copy in memory of its own: XLA does not vectorise a loop that reads its own carry
             keys = computed_once(keys)
             best = jnp.max(keys, 0)
             found = best > above
@@ -162,5 +167,5 @@ class _Turns(eqx.Module):
 
 
 def _ordered(value: Float32[Array, "*s"]) -> Int32[Array, "*s"]:
-    """Return the bits of non-negative floats, which are ordered as the floats: their maximum is faster."""
+    """Return the bits of non-negative floats as integers: the order is the same, and a maximum is faster."""
     return jax.lax.bitcast_convert_type(jnp.maximum(value, 0.0), jnp.int32)

@@ -1,7 +1,7 @@
-"""A scan as an image: one column of the array per ring, along it the ring's points without gaps.
+"""A scan as an image: each column of the array holds the points of one ring, without gaps.
 
-An array of shape (k, rings) holds a ring's neighbours one row apart, so that a window along the rings is a
-sum of whole, contiguous rows.
+In an array of shape (k, rings) the neighbours along a ring are one row apart, so a window along all rings is
+a sum of whole, contiguous rows.
 """
 
 import equinox as eqx
@@ -16,32 +16,33 @@ from lio_jax.lidar.params import Params, RingConfig
 
 
 class RangeImage(eqx.Module):
-    """Which point of a scan lies where, ring by ring; a ring's points are 0 .. count-1."""
+    """Which point of a scan lies at each place of each ring; a ring's points are 0 .. count-1."""
 
     index: Int32[Array, "k rings"]
-    """Into the scan; 0 beyond a ring's count."""
+    """Index of the point in the scan; 0 beyond a ring's count."""
     column: Int32[Array, "k rings"]
-    """Of the sweep, from the azimuth; the place along the ring where the points are in order of arrival."""
+    """Column of the sweep by azimuth; with ``order="arrival"`` the place along the ring."""
     count: Int32[Array, " rings"]
+    """Number of points of each ring."""
     dropped: Int32[Array, ""]
-    """Points that found no room: of rings beyond the configured number, or of rings that are too long, which
-    are thinned evenly."""
+    """Number of points beyond the capacity: those of rings above the configured number, and those by which
+    rings that are too long were thinned evenly."""
 
     @property
     def mask(self) -> Bool[Array, "k rings"]:
-        """Return where there are points."""
+        """Return True where there is a point."""
         return jnp.arange(self.index.shape[0], dtype=jnp.int32)[:, None] < self.count
 
 
 def range_image(config: RingConfig, params: Params, scan: Scan) -> RangeImage:
     """Sort a scan's points into rings.
 
-    With ``order="azimuth"`` (LIO-SAM) the first point that falls into a column takes it, later ones are left
-    out; columns count counter-clockwise from straight behind. With ``order="arrival"`` (A-LOAM; LIO-SAM's
-    Livox lines) all points are kept in the order of the scan.
+    With ``order="azimuth"`` (LIO-SAM) a column keeps the first point that falls into it, and later points are
+    left out. Columns count counter-clockwise from straight behind. With ``order="arrival"`` (A-LOAM, and
+    LIO-SAM for the lines of a Livox) all points are kept in the order of the scan.
 
     Args:
-        config: numbers of rings and columns, order.
+        config: numbers of rings and columns, and the order.
         params: ``lidar.min_range`` and ``lidar.max_range`` bound the points that count.
         scan: padded sweep. Points that are not finite are left out.
     """
@@ -109,10 +110,10 @@ _LANES = 32
 def rank_within_ring(
     ring: Int32[Array, " n"], mask: Bool[Array, " n"], rings: int
 ) -> tuple[Int32[Array, " n"], Int32[Array, " rings"]]:
-    """Return how many earlier points each point's ring has, and how many the ring has in all.
+    """Return the number of earlier points in each point's ring, and the number of points in each ring.
 
-    A counting sort without the sort: each run of 32 points leaves a bit mask per ring, whose counts are
-    summed over the runs before, and whose lower bits are the earlier points of the same run.
+    Each run of 32 points has a bit mask per ring. The numbers of bits are summed over the runs before, and
+    the lower bits of the run's own mask are the earlier points of the same run. So no sort is needed.
 
     Args:
         ring: 0 .. rings-1 where the mask is true.
@@ -135,13 +136,13 @@ def _bits(words: Array) -> Array:
 
 
 def azimuth_column(points: Float32[Array, "n 3"], columns: int) -> Int32[Array, " n"]:
-    """Return the column of each point among ``columns`` of a full turn, counter-clockwise from behind.
+    """Return the column of each point, counter-clockwise from straight behind.
 
-    The point straight ahead lies in the middle of column ``columns / 2``, as in LIO-SAM.
+    A point straight ahead lies in the middle of column ``columns / 2``, as in LIO-SAM.
 
     Args:
         points: m, lidar frame.
-        columns: of a full turn.
+        columns: number of columns of a full turn.
     """
     turn = azimuth(points[:, 0], points[:, 1]) * jnp.float32(columns / (2 * np.pi))
     column = jnp.floor(turn + jnp.float32(0.5)).astype(jnp.int32) + columns // 2
@@ -159,13 +160,16 @@ _ARCTAN = (
     -0.3333314528,
     1.0,
 )
-"""arctan(x) / x in powers of x^2, highest first, to 2e-8 on [0, 1].
+"""Coefficients of arctan(x) / x in powers of x^2, highest first, with an error of 2e-8 on [0, 1].
 
-Abramowitz & Stegun, Handbook of Mathematical Functions, 4.4.49."""
+Source: Abramowitz & Stegun, Handbook of Mathematical Functions, 4.4.49."""
 
 
 def azimuth(x: Float32[Array, "*n"], y: Float32[Array, "*n"]) -> Float32[Array, "*n"]:
-    """Return atan2(y, x) to float32: ``jnp.arctan2`` calls a scalar routine for each point on a CPU."""
+    """Return atan2(y, x), rad, with float32's precision.
+
+    On a CPU ``jnp.arctan2`` calls a scalar routine for each point, which is slower.
+    """
     across, along = jnp.abs(y), jnp.abs(x)
     ratio = jnp.minimum(across, along) / jnp.maximum(jnp.maximum(across, along), jnp.float32(1e-30))
     squared, series = ratio * ratio, jnp.zeros_like(ratio)

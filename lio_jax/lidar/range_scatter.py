@@ -1,4 +1,4 @@
-"""How far a scan's returns lie off the planes through their neighbours: the range noise, before any map."""
+"""Range residuals of a scan against planes through neighbouring returns: the range noise, without a map."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,32 +8,34 @@ from lio_jax.core.types import Scan
 from lio_jax.lidar.params import Params
 
 _APART = (1e-5, 0.025)
-"""Angles between neighbours of a ring, rad: closer ones are returns of one pulse, others have lost neighbours
-between them."""
+"""Smallest and largest angle between neighbours of a ring, rad. Closer returns belong to one pulse; between
+farther ones a return is missing."""
 _STEEPEST = 0.866
-"""Sine of incidence up to which neighbours are compared: at grazing incidence they tell of the beams."""
+"""Largest sine of the angle of incidence: at grazing incidence the residuals are those of the beams'
+directions."""
 
 
 class RangeScatter(eqx.Module):
-    """Returns against the plane through their two neighbours along the ring, each return used once."""
+    """Residuals of returns against the plane through their two neighbours; each return is used once."""
 
     deviation: Float[Array, " t"]
-    """Range beyond that plane, m."""
+    """Measured range less the range of that plane, m."""
     spread: Float[Array, " t"]
-    """Standard deviation of ``deviation`` by range noise of 1 m on each of the three."""
+    """Standard deviation of ``deviation``, m, for range noise of 1 m on each of the three returns."""
     slope: Float[Array, " t"]
-    """The same by noise of 1 rad of the beams' directions, m."""
+    """Standard deviation of ``deviation``, m, for noise of 1 rad on the beams' directions; it has a sign."""
     valid: Bool[Array, " t"]
+    """True where all three returns are usable neighbours."""
 
 
 def range_scatter(scan: Scan, params: Params) -> RangeScatter:
-    """Return the deviations of every third return of each ring.
+    """Return the range residuals of every third return of each ring.
 
-    On a plane the inverse range is linear in the beam's direction, so that the ranges of two neighbours
-    foretell the one between them. Edges between the three make outliers.
+    On a plane the inverse range is linear in the beam's direction, so the ranges of two neighbours predict
+    the range between them. Edges between the three returns make outliers.
 
     Args:
-        scan: padded sweep, each ring's returns in the order they were taken.
+        scan: padded sweep; the returns of each ring are in the order in which they were taken.
         params: ``lidar.min_range`` and ``lidar.max_range`` bound the returns that count.
     """
     lidar = params.lidar
@@ -48,7 +50,7 @@ def range_scatter(scan: Scan, params: Params) -> RangeScatter:
     after = _angle(middle / here[:, None], last / far[:, None])
     both = jnp.sin(before + after)
     own = jnp.where(both > 0, both, 1.0)
-    # the middle direction is a combination of the outer ones
+    # the middle direction is a linear combination of the outer ones
     share_near, share_far = jnp.sin(after) / own, jnp.sin(before) / own
     inverse = share_near / near + share_far / far
     foretold = 1 / jnp.where(inverse > 0, inverse, 1.0)
@@ -68,5 +70,5 @@ def range_scatter(scan: Scan, params: Params) -> RangeScatter:
 
 
 def _angle(one: Float[Array, "t 3"], other: Float[Array, "t 3"]) -> Float[Array, " t"]:
-    """Return the angles between unit vectors, rad: by the chord, exact in float32 where they are small."""
+    """Return the angles between unit vectors, rad; from the chord, which is precise for small angles."""
     return 2 * jnp.arcsin(jnp.minimum(jnp.linalg.norm(one - other, axis=-1) / 2, 1.0))

@@ -11,16 +11,18 @@ from lio_jax.core.xla import computed_once
 
 
 class RingMeans(eqx.Module):
-    """One row per ring and occupied voxel."""
+    """One row per ring and occupied voxel, padded to m."""
 
     points: Float32[Array, "m 3"]
-    """m."""
+    """Mean point, m, in the frame of the input."""
     time: Float32[Array, " m"]
-    """s."""
+    """Mean time, s."""
     ring: Int32[Array, " m"]
+    """Number of the ring."""
     mask: Bool[Array, " m"]
+    """True where a row is real, False on padding."""
     dropped: Int32[Array, ""]
-    """Rows that found no room in the capacity."""
+    """Number of rows beyond the capacity."""
 
 
 def mean_per_ring_and_voxel(
@@ -32,11 +34,11 @@ def mean_per_ring_and_voxel(
 ) -> RingMeans:
     """Return the mean point and time of each ring in each cubic voxel, ring after ring.
 
-    More rows than ``capacity`` are thinned evenly.
+    If there are more rows than ``capacity``, they are thinned evenly.
 
     Args:
-        xyz: m, any frame; finite where the mask is true.
-        time: s.
+        xyz: coordinates x, y and z in any frame, m; finite where the mask is true.
+        time: time of each point, s.
         mask: which points are real.
         voxel_size: edge length, m.
         capacity: number of returned rows.
@@ -70,11 +72,11 @@ def _first_of_voxel(
     voxel: tuple[Int32[Array, "k rings"], Int32[Array, "k rings"], Int32[Array, "k rings"]],
     mask: Bool[Array, "k rings"],
 ) -> Int32[Array, " c"]:
-    """Return for each point the first one of its ring in its voxel, (k * rings,); k * rings without a point.
+    """Return for each point the first point of its ring in its voxel; k * rings where there is no point.
 
-    Each ring has a hash table of its own. Points whose slot was taken by another voxel try again with
-    another hash until all are settled: about three rounds. Two voxels in one slot are told apart by 32 bits
-    of their coordinates, which repeat every 2048 voxels in x and y and every 1024 in z.
+    Each ring has its own hash table. Points whose slot belongs to another voxel try again with another hash,
+    until all have a slot: about three rounds. Two voxels in one slot are distinguished by 32 bits of their
+    coordinates, which repeat every 2048 voxels in x and y and every 1024 in z.
     """
     k, rings = mask.shape
     cells, slots = k * rings, 1 << k.bit_length()

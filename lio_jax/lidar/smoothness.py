@@ -1,7 +1,7 @@
-"""How sharply a ring bends at each of its points, and which points must not be trusted as features.
+"""The curvature of a ring at each of its points, and the points that are unreliable as features.
 
-Arrays of shape (k, rings) are those of :class:`~lio_jax.lidar.range_image.RangeImage`. Beside a ring's ends
-and beyond its points the values mean nothing; the selection does not look there.
+Arrays of shape (k, rings) are those of :class:`~lio_jax.lidar.range_image.RangeImage`. Near a ring's ends and
+beyond its points the values have no meaning; the selection does not use them.
 """
 
 import jax
@@ -16,13 +16,13 @@ def point_smoothness(
 ) -> Float32[Array, "k rings"]:
     """Return the squared length of the sum of differences to the neighbours along the ring, m^2.
 
-    |sum over j of (p_j - p_i)|^2 over the ``neighbours`` points before and as many after: the curvature of
-    A-LOAM, and that of Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014, eq. (1)
-    without its normalisation.
+    The value is |sum over j of (p_j - p_i)|^2, over ``neighbours`` points before and as many after. It is the
+    curvature of A-LOAM, and that of Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014,
+    eq. (1), without the normalisation.
 
     Args:
-        points: x, y and z, m.
-        neighbours: on either side.
+        points: coordinates x, y and z, m.
+        neighbours: number of neighbours on either side.
     """
     total = jnp.zeros_like(points[0])
     for axis in points:
@@ -35,7 +35,7 @@ def range_smoothness(ranges: Float32[Array, "k rings"], neighbours: int) -> Floa
 
     Args:
         ranges: m.
-        neighbours: on either side.
+        neighbours: number of neighbours on either side.
     """
     return _bend(ranges, neighbours) ** 2
 
@@ -49,18 +49,18 @@ def occluded(
     columns_apart: Float32[Array, ""],
     neighbours: int,
 ) -> Bool[Array, "k rings"]:
-    """Tell which points lie behind an edge that hides the rest of their surface from the sensor (LIO-SAM).
+    """Return which points are behind an edge that hides the rest of their surface from the sensor (LIO-SAM).
 
-    Where two points that follow each other are less than ``columns_apart`` and their ranges differ by more
-    than ``step``, the farther one and ``neighbours`` more on its side are hidden.
+    If two consecutive points are fewer than ``columns_apart`` columns apart and their ranges differ by more
+    than ``step``, the farther one and ``neighbours`` more points on its side are occluded.
 
     Args:
         ranges: m.
-        column: of the sweep.
+        column: column of the sweep that each point lies in.
         mask: which rows are points.
-        step: m.
-        columns_apart: columns.
-        neighbours: number of points beside the farther one.
+        step: least difference of the ranges at an edge, m.
+        columns_apart: distance of the two points, columns.
+        neighbours: number of further points on the side of the farther one.
     """
     close = mask & after_each(mask)
     close &= jnp.abs(after_each(column) - column).astype(jnp.float32) < columns_apart
@@ -76,11 +76,11 @@ def occluded(
 
 
 def parallel_to_beam(ranges: Float32[Array, "k rings"], ratio: Float32[Array, ""]) -> Bool[Array, "k rings"]:
-    """Tell which points differ in range from both neighbours by more than ``ratio`` of their own (LIO-SAM).
+    """Return which points differ in range from both neighbours by more than a share of their range (LIO-SAM).
 
     Args:
         ranges: m.
-        ratio: no unit.
+        ratio: the share, no unit.
     """
     framed = _framed(ranges, 1)
     limit = ratio * ranges
@@ -91,11 +91,11 @@ def parallel_to_beam(ranges: Float32[Array, "k rings"], ratio: Float32[Array, ""
 def reach(
     connected: Bool[Array, "k rings"], neighbours: int
 ) -> tuple[Int32[Array, "k rings"], Int32[Array, "k rings"]]:
-    """Return how many points before and after each one a pick there suppresses, at most ``neighbours``.
+    """Return the numbers of points before and after a pick that it suppresses, for a pick at each place.
 
     Args:
-        connected: whether suppression passes from a point to the one after it.
-        neighbours: on either side.
+        connected: whether suppression passes from a point to the next one.
+        neighbours: largest number on either side.
     """
     passes = computed_once(_framed(connected, neighbours))
     before, after = jnp.zeros(connected.shape, jnp.int32), jnp.zeros(connected.shape, jnp.int32)
@@ -106,12 +106,12 @@ def reach(
 
 
 def after_each(values: Shaped[Array, "k rings"]) -> Shaped[Array, "k rings"]:
-    """Return the value of the next point along the ring, zero beyond the last."""
+    """Return the value of the next point along the ring; zero for the last row."""
     return jnp.concatenate([values[1:], jnp.zeros_like(values[:1])])
 
 
 def _bend(values: Float32[Array, "k rings"], neighbours: int) -> Float32[Array, "k rings"]:
-    """Return the sum of the differences to the neighbours: it keeps digits that sum - 2 n v would lose."""
+    """Return the sum of the differences to the neighbours, which loses fewer digits than sum - 2 n v."""
     inner = values[neighbours:-neighbours]
     total = jnp.zeros_like(inner)
     for step in range(1, neighbours + 1):
@@ -121,7 +121,7 @@ def _bend(values: Float32[Array, "k rings"], neighbours: int) -> Float32[Array, 
 
 
 def _framed(values: Shaped[Array, "k rings"], margin: int) -> Shaped[Array, "f rings"]:
-    """Return the values with ``margin`` rows of zeros before and after: windows on it need no tests."""
+    """Return the values with ``margin`` rows of zeros before and after: windows then need no bounds test."""
     return jnp.pad(values, ((margin, margin), (0, 0)))
 
 

@@ -1,4 +1,7 @@
-"""Thin a scan: one point a voxel, or the mean of the points in it."""
+"""Thin a scan to one point per voxel: one of the voxel's points, or their mean.
+
+A scan is thinned in two steps: to the spacing of the map, and from that to the spacing of registration.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,26 +15,28 @@ from lio_jax.lidar.params import Params
 
 
 class Selection(eqx.Module):
-    """Indices into a scan, padded to a capacity."""
+    """Indices into a scan, padded to a capacity k."""
 
     index: Int32[Array, " k"]
+    """Row of each selected point; 0 on padding."""
     mask: Bool[Array, " k"]
+    """True where an index is real, False on padding."""
     dropped: Int32[Array, ""]
-    """Occupied cells that found no room in the capacity."""
+    """Number of occupied slots beyond the capacity."""
 
 
 def select_per_voxel(
     points: Float[Array, "n 3"], mask: Bool[Array, " n"], voxel_size: Float[Array, ""], capacity: int
 ) -> Selection:
-    """Select at most one point of each cubic voxel, at most ``capacity`` in all.
+    """Select at most one point of each cubic voxel, and at most ``capacity`` points.
 
-    Every point writes a scrambled copy of its index into the slot its voxel hashes to and the largest one
-    stays, so which point represents a voxel is a fixed pseudo-random choice. Two voxels that share a slot
-    lose one of them, and slots beyond the capacity are cut off; both thin the scan evenly over space, because
-    slots are hashes. Indices carry no gradient.
+    Every point writes a permuted copy of its index into the slot of its voxel's hash, and the largest one
+    stays. So the choice of a voxel's point is pseudo-random and repeatable. Of two voxels that share a slot
+    only one is represented, and slots beyond the capacity are dropped. Both thin the scan evenly over space,
+    because slots are hashes. The indices have no derivative.
 
     Args:
-        points: m, any frame.
+        points: m, any frame; at most 2^24 rows.
         mask: which rows are real.
         voxel_size: edge length, m.
         capacity: number of returned indices.
@@ -60,7 +65,7 @@ _INVERSE = pow(_FACTOR, -1, 1 << _BITS)
 
 
 def _scramble(index: Array) -> Array:
-    """Permute 0 .. 2^24 - 1 (odd multiplier modulo a power of two)."""
+    """Return a permutation of 0 .. 2^24 - 1: the product with an odd number modulo a power of two."""
     return (index * jnp.uint32(_FACTOR)) & jnp.uint32(_MASK)
 
 
@@ -72,14 +77,15 @@ class ThinnedScan(eqx.Module):
     """A scan's points for the map, and which of them are matched against it."""
 
     points: Float[Array, "m 3"]
-    """m, lidar frame at each point's own firing time."""
+    """Coordinates in the lidar frame at the firing time of each point, m."""
     time: Float[Array, " m"]
     """Firing time from the scan's start, s."""
     mask: Bool[Array, " m"]
+    """True where a point is real, False on padding."""
     matched: Selection
-    """Rows of the above."""
+    """Rows of ``points`` that are matched against the map."""
     dropped: Int32[Array, ""]
-    """Occupied cells beyond the capacities."""
+    """Number of occupied slots beyond the two capacities."""
 
 
 def thinned(
@@ -92,17 +98,17 @@ def thinned(
     """Return the scan within its range limits, thinned to the spacings of map and registration.
 
     Args:
-        params: range limits and the map's spacing.
+        params: ``lidar.min_range``, ``lidar.max_range`` and ``map.point_spacing``.
         scan: padded sweep.
-        registration_spacing: of the points to match, m.
-        insertion_points: capacity for the map.
-        registration_points: capacity of those to match.
+        registration_spacing: edge of the voxels from which one point is matched, m.
+        insertion_points: capacity for the points of the map.
+        registration_points: capacity for the points to match.
     """
     squared_range = jnp.sum(scan.points**2, -1)
     near, far = params.lidar.min_range.astype(jnp.float32), params.lidar.max_range.astype(jnp.float32)
     mask = scan.mask & (squared_range > near**2) & (squared_range < far**2)
     chosen = select_per_voxel(scan.points, mask, params.map.point_spacing, insertion_points)
-    # what is not finite in an empty row would spoil the derivatives of sums that leave it out
+    # a value that is not finite in an empty row would make the derivatives of masked sums NaN
     points = jnp.where(chosen.mask[:, None], scan.points[chosen.index], 0.0)
     matched = select_per_voxel(points, chosen.mask, registration_spacing, registration_points)
     return ThinnedScan(
@@ -111,15 +117,16 @@ def thinned(
 
 
 class MeanPoints(eqx.Module):
-    """One point per occupied voxel, the real ones first."""
+    """One mean point per occupied voxel, padded to k, the real ones first."""
 
     points: Float[Array, "k 3"]
-    """m."""
+    """Mean point, m, in the frame of the input."""
     time: Float[Array, " k"] | None
-    """s; None where the points have none."""
+    """Mean time, s; None where the points have no time."""
     mask: Bool[Array, " k"]
+    """True where a row is real, False on padding."""
     dropped: Int32[Array, ""]
-    """Occupied voxels that found no room in the capacity."""
+    """Number of occupied slots beyond the capacity."""
 
 
 def mean_per_voxel(
@@ -129,17 +136,17 @@ def mean_per_voxel(
     capacity: int,
     time: Float[Array, " n"] | None = None,
 ) -> MeanPoints:
-    """Return the mean of each cubic voxel's points, of at most ``capacity`` voxels.
+    """Return the mean of each cubic voxel's points, for at most ``capacity`` voxels.
 
-    Voxels are hashed into slots. Of two that share one the second is left out, and slots beyond the capacity
-    are cut off; both thin the scan evenly over space, because slots are hashes.
+    Voxels are hashed into slots. Of two voxels that share a slot one is left out, and slots beyond the
+    capacity are dropped. Both thin the scan evenly over space, because slots are hashes.
 
     Args:
         points: m, any frame.
         mask: which rows are real.
         voxel_size: edge length, m.
         capacity: number of returned rows.
-        time: of the points, to be averaged with them, s.
+        time: time of each point, s, to be averaged as well; None: the points have no time.
     """
     table_size = 1 << (4 * capacity - 1).bit_length()
     voxel = jnp.floor(jnp.where(mask[:, None], points, 0.0) / voxel_size).astype(jnp.int32)

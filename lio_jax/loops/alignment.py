@@ -1,4 +1,7 @@
-"""Align the points of one place with those of another from several first guesses, on the device."""
+"""Align the points of one place with those of another, from several first guesses, on the device.
+
+Each guess is refined first with a coarse map of the target, then with a fine one.
+"""
 
 from typing import NamedTuple
 
@@ -17,27 +20,29 @@ from lio_jax.registration.params import Params
 from lio_jax.registration.voxel_plane_icp import register
 
 _CAPACITY = 65536
-"""Voxels of the map that points are aligned with."""
+"""Number of voxels of the target's map."""
 _COARSE = 2.0
-"""The first map's voxels are so many times larger ..."""
+"""Size of the coarse map's voxels over that of the fine map's."""
 _COARSE_ERROR, _FINE_ERROR = 1.5, 0.5
-"""... as the guesses and the first result may be wrong by about this, m: it opens the robust kernel."""
+"""Error of the guesses and of the coarse result, m; the robust kernel is wide enough for it."""
 _ITERATIONS = 30
+"""Largest number of iterations with each map."""
 _REACH = 1e5
-"""No voxel is farther than this from the target, m: none is forgotten."""
+"""Distance beyond which the map may forget a voxel, m: larger than any, so that none is forgotten."""
 
 
 class Alignments(NamedTuple):
-    """What each guess led to."""
+    """The results of n guesses."""
 
     T_target_source: NDArray[np.float64]
-    """(n, 4, 4)."""
+    """(n, 4, 4) aligned poses of the source in the target's frame, m."""
     information: NDArray[np.float64]
-    """(n, 6, 6) inverse covariance of the right perturbation, rotation first; all points independent."""
+    """(n, 6, 6) inverse covariance of the right perturbation, rotation (rad) before translation (m), as if
+    the errors of all points were independent."""
     degenerate: NDArray[np.bool_]
-    """(n,) whether the points leave a direction open."""
+    """(n,) True where a direction is not observable."""
     converged: NDArray[np.bool_]
-    """(n,)."""
+    """(n,) True where the alignment converged."""
 
 
 def aligned(
@@ -49,16 +54,16 @@ def aligned(
     most: int,
     params: Params,
 ) -> Alignments:
-    """Return the alignments from some guesses.
+    """Return the alignment from each of n guesses.
 
     Args:
-        target: (m, 3) m, padded to a size that is always the same.
-        target_mask: (m,) which rows are real.
-        source: (k, 3) m, padded likewise.
-        source_mask: (k,).
-        guesses: (n, 4, 4) T_target_source, at most ``most``.
-        most: number of guesses that the program is compiled for.
-        params: ``params.map.voxel_size`` is that of the final map.
+        target: (m, 3) points of the target, m, padded to a fixed size.
+        target_mask: (m,) which rows of ``target`` are real.
+        source: (k, 3) points of the source, m, padded to a fixed size.
+        source_mask: (k,) which rows of ``source`` are real.
+        guesses: (n, 4, 4) T_target_source, m; at most ``most`` of them.
+        most: number of guesses for which the program is compiled.
+        params: parameters of registration; ``params.map.voxel_size`` is that of the fine map.
     """
     count = len(guesses)
     padded = np.concatenate([guesses, np.repeat(guesses[:1], most - count, axis=0)])
@@ -74,7 +79,7 @@ def aligned(
 
 
 class _Still(eqx.Module):
-    """Points that need no compensation."""
+    """Points without motion compensation."""
 
     points: Float32[Array, "k 3"]
 
@@ -99,7 +104,7 @@ def _aligned(
 
         def one(case: tuple[Array, Array]) -> Registration:
             number, start = case
-            # guesses that only fill up cost nothing
+            # padded guesses have no points, so they cost nothing
             mask = source_mask & (number < count)
             return register(
                 vmap, _Still(source), mask, jaxlie.SE3(start), jnp.asarray(error, dtype), sized, _ITERATIONS

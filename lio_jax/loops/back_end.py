@@ -1,4 +1,9 @@
-"""The back end: a pose graph of keyframes, loops and GPS fixes, and how it corrects the odometry."""
+"""The back end: a pose graph of keyframes, loops and GPS fixes, and the correction of the odometry by it.
+
+:class:`BackEnd` takes keyframes in order, adds their edges to the graph and solves it when necessary.
+:func:`solved` is the robust solve of the graph. :func:`corrected_poses` interpolates the correction of the
+keyframes for all poses of the odometry.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -40,17 +45,18 @@ def corrected_poses(
     keyframes_T_odom_imu: _Array,
     keyframes_T_world_imu: _Array,
 ) -> _Array:
-    """Return T_world_imu (n, 4, 4) of poses of the odometry.
+    """Return the corrected poses T_world_imu, (n, 4, 4) m, of poses of the odometry.
 
-    A pose between two keyframes is where each of them sees it, weighed by time; one before the first or
-    behind the last is where that one sees it. Keyframes themselves get their own corrected pose.
+    The correction of a pose between two keyframes is interpolated in time between the corrections of these
+    two. Before the first keyframe it is that of the first, and after the last one that of the last. The
+    result for a keyframe is its own corrected pose.
 
     Args:
-        stamp_ns: (n,) of the poses.
-        T_odom_imu: (n, 4, 4).
-        keyframe_stamp_ns: (k,) ascending, k > 0.
-        keyframes_T_odom_imu: (k, 4, 4).
-        keyframes_T_world_imu: (k, 4, 4) as corrected.
+        stamp_ns: (n,) times of the poses, ns.
+        T_odom_imu: (n, 4, 4) poses of the odometry, m.
+        keyframe_stamp_ns: (k,) times of the keyframes, ns, ascending, at least one.
+        keyframes_T_odom_imu: (k, 4, 4) poses of the keyframes by the odometry, m.
+        keyframes_T_world_imu: (k, 4, 4) corrected poses of the keyframes, m.
     """
     last = len(keyframe_stamp_ns) - 1
     before = np.clip(np.searchsorted(keyframe_stamp_ns, stamp_ns, side="right") - 1, 0, last)
@@ -68,13 +74,14 @@ def corrected_poses(
 
 
 def levelled_onto(T_a_imu: _Array, T_b_imu: _Array) -> _Array:
-    """Return T_b_a, a turn about the vertical and a shift, that lays one pose of z-up frame a onto b's.
+    """Return the (4, 4) transformation T_b_a between two z-up frames that aligns a pose given in both.
 
-    The heading agrees as far as a turn about the vertical can make it; the position agrees.
+    It is a rotation about the vertical and a translation. The positions agree exactly, and the headings as
+    well as a rotation about the vertical allows.
 
     Args:
-        T_a_imu: (4, 4).
-        T_b_imu: (4, 4).
+        T_a_imu: (4, 4) pose in frame a, m.
+        T_b_imu: (4, 4) the same pose in frame b, m.
     """
     between = T_b_imu[:3, :3] @ T_a_imu[:3, :3].T
     yaw = np.arctan2(between[1, 0] - between[0, 1], between[0, 0] + between[1, 1])
@@ -85,49 +92,54 @@ def levelled_onto(T_a_imu: _Array, T_b_imu: _Array) -> _Array:
 
 
 _SUSPICIOUS = 1e-4
-"""An edge that lies this far out, by the chi-square distribution, has the whole graph solved robustly."""
+"""Probability, by the chi-square distribution, of a residual for which the graph is solved robustly."""
 
 
 _SYSTEMATIC = 5.0
-"""So many sigmas the odometry may be off in the same direction, keyframe after keyframe."""
+"""Systematic error of the odometry in a robust solve, standard deviations of each edge."""
 
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """One measurement."""
+    """One measurement between keyframes or of one keyframe."""
 
     kind: int
     """ODOMETRY, LOOP, PRIOR or POSITION."""
     i: int
+    """Index of the first keyframe; that of ``j`` for a prior and for a position."""
     j: int
+    """Index of the second keyframe."""
     measured: _Array
-    """(4, 4): T_i_j, or T_world_j of a prior; of a position only the translation counts."""
+    """(4, 4) measured T_i_j, m; for a prior T_world_j; for a position only the translation is used."""
     information: _Array
-    """(6, 6) of the right perturbation, rotation (rad) first; of a position in world axes."""
+    """(6, 6) information of the right perturbation, rotation (rad) before translation (m); for a position
+    that of the coordinates in world."""
     lever: _Array | None = None
-    """(3,) m, in the frame of j: the point whose position is measured; None: the origin."""
+    """(3,) point whose position is measured, in the frame of j, m; None: the origin."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The graph's poses and how far each edge is believed."""
+    """The solution of a graph of k keyframes and e edges."""
 
     poses: _Array
-    """(k, 4, 4) T_world_keyframe."""
+    """(k, 4, 4) T_world_keyframe, m."""
     weights: _Array
-    """(e,) 1, or below where an edge contradicts the others."""
+    """(e,) weight of each edge: 1, or less where an edge contradicts the others."""
 
 
 def solved(poses: _Array, edges: list[Edge]) -> Solved:
     """Return the poses that agree best with the edges.
 
-    Trusting all edges first is many times quicker; only where an edge then lies improbably far off are loops
-    and positions doubted. For that the odometry counts less: its errors follow each other, and true loops,
-    which all contradict it in the same way, must not be taken for the wrong ones.
+    A first solve trusts all edges, which is many times faster. A robust solve follows only if an edge then
+    has an improbable residual; it may reject loops and positions. In it the odometry has less information:
+    its errors are correlated, so correct loops may all contradict it in the same way and must not be
+    rejected.
 
     Args:
-        poses: (k, 4, 4) to begin with; the first one stays where no prior or position ties the graph.
-        edges: between them.
+        poses: (k, 4, 4) first guess of T_world_keyframe, m. Without a prior or a position the first pose does
+            not change.
+        edges: measurements between the keyframes.
     """
     graph = graph_of(poses, edges)
     plain = solve(graph, start="poses")
@@ -148,7 +160,7 @@ def solved(poses: _Array, edges: list[Edge]) -> Solved:
 
 
 def _robust_weights(poses: _Array, edges: list[Edge], doubted: NDArray[np.bool_]) -> _Array:
-    """Return the (e,) weights of the better one of two truncated least squares: both are local searches."""
+    """Return the (e,) weights of the better of two truncated least squares: each finds a local minimum."""
     begins: tuple[Literal["trusted", "given"], ...] = ("trusted", "given")
     found = []
     for begin in begins:
@@ -164,7 +176,12 @@ def _robust_weights(poses: _Array, edges: list[Edge], doubted: NDArray[np.bool_]
 
 
 def graph_of(poses: _Array, edges: list[Edge]) -> PoseGraph:
-    """Return the pose graph of (k, 4, 4) poses and the edges between them."""
+    """Return the pose graph of keyframes and edges.
+
+    Args:
+        poses: (k, 4, 4) T_world_keyframe, m.
+        edges: measurements between the keyframes.
+    """
     measured = np.array([edge.measured for edge in edges]).reshape(-1, 4, 4)
     levers = np.array([np.zeros(3) if edge.lever is None else edge.lever for edge in edges]).reshape(-1, 3)
     return PoseGraph(
@@ -184,56 +201,63 @@ def _se3(poses: _Array) -> Poses:
 
 
 _SOLVE_EVERY, _SOLVE_SHARE = 20, 0.05
-"""Keyframes from one solve to the next while loops and fixes come in that agree with the poses, and as a
-share of all: the work of a drive stays nearly linear in its length."""
+"""Number of keyframes between two solves while new loops and fixes agree with the poses, and its least share
+of all keyframes. With the share the work grows almost linearly with the length of a drive."""
 _UNKNOWN_YAW, _UNKNOWN_POSITION = np.pi, 1e4
-"""Sigmas of the first pose on the earth, rad and m, as in LIO-SAM; fixes tell both."""
+"""Prior standard deviations of the first pose's heading (rad) and position (m) on the earth, as in LIO-SAM.
+The fixes determine both."""
 
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What the back end made of a drive."""
+    """The result of the back end for k keyframes and e edges."""
 
     stamp_ns: NDArray[np.int64]
-    """(k,) of the keyframes."""
+    """(k,) times of the keyframes, ns."""
     T_odom_imu: _Array
-    """(k, 4, 4) by the odometry."""
+    """(k, 4, 4) poses of the keyframes by the odometry, m."""
     T_world_imu: _Array
-    """(k, 4, 4) corrected, in a z-up world in which the first keyframe keeps its position and heading."""
+    """(k, 4, 4) corrected poses, m, in a z-up world with the first keyframe's position and heading."""
     edges: list[Edge]
+    """All edges of the graph."""
     weights: _Array
-    """(e,) of the edges: 1, or below where one contradicts the others."""
+    """(e,) weight of each edge: 1, or less where an edge contradicts the others."""
     loops: list[tuple[Verdict, float | None]]
-    """Every proposed loop and, of those that entered the graph, the weight."""
+    """Every proposed loop, with its weight if it entered the graph."""
     fixes: dict[str, int]
-    """How many keyframes were tied to a GPS fix, and how many were not, by reason."""
+    """Number of keyframes with a GPS fix in the graph, and the numbers of those without, by reason."""
     T_enu_world: _Array | None
-    """(4, 4) from world to the fixes' east-north-up frame; None without fixes, or too few for the heading."""
+    """(4, 4) pose of the world in the fixes' east-north-up frame, m; None while the heading is unknown."""
 
 
 @runtime_checkable
 class FindsLoops(Protocol):
-    """Such as :class:`lio_jax.loops.closing.LoopCloser`."""
+    """A source of loops, for example :class:`lio_jax.loops.closing.LoopCloser`."""
 
     def take(self, keyframes: Sequence[Keyframe], poses: _Array) -> list[Verdict]:
-        """Take up the newest keyframe; return the loops that enter the graph now."""
+        """Take the newest keyframe, and return the loops that enter the graph now.
+
+        Args:
+            keyframes: all so far; each call brings one more.
+            poses: (k, 4, 4) their corrected T_world_imu, m.
+        """
         ...
 
     def outcomes(self) -> list[Verdict]:
-        """Return every proposal so far with what became of it."""
+        """Return the verdicts on all proposals so far."""
         ...
 
 
 class BackEnd:
-    """Takes keyframes in order."""
+    """A pose graph that grows with each keyframe."""
 
     def __init__(self, settings: BackEndSettings, closer: FindsLoops | None, gate: GpsGate | None) -> None:
         """Begin without keyframes.
 
         Args:
             settings: ``params.backend`` and ``params.gps``.
-            closer: finds loops; None: none are closed.
-            gate: chooses GPS fixes; None: they are not used.
+            closer: source of loops; None: no loops are closed.
+            gate: choice of GPS fixes; None: fixes are not used.
         """
         self._tilt_sigma: float = settings.values["backend"]["tilt_sigma"]
         self._lever = np.asarray(settings.values["gps"]["lever_arm"], np.float64)
@@ -241,19 +265,19 @@ class BackEnd:
         self._closer, self._gate = closer, gate
         self._keyframes: list[Keyframe] = []
         self._poses = np.zeros((0, 4, 4))
-        """In the odometry's world; from the alignment on in the fixes' frame."""
+        """(k, 4, 4) poses of the keyframes, m, in the odometry's world, or in the fixes' once aligned."""
         self._edges: list[Edge] = []
         self._fixes: list[tuple[int, Fix]] = []
         self._aligned = False
         self._since_fix = np.zeros((6, 6))
-        """Covariance of the last pose, given the last fix."""
+        """Covariance of the last pose relative to the keyframe with the last fix."""
         self._weights = np.zeros(0)
         self._unsolved = 0
-        """Loops and fixes that entered the graph since it was solved."""
+        """Number of loops and fixes that entered the graph after the last solve."""
         self._solved_at = 0
 
     def add(self, keyframe: Keyframe) -> None:
-        """Take the next keyframe; its loops and its fix enter the graph, which is solved where it is due."""
+        """Add the next keyframe with its loops and its fix, and solve the graph if that is due."""
         self._append(keyframe)
         surprised = self._close_loops(self._closer) if self._closer else False
         surprised |= self._tie_to_earth(self._gate) if self._gate else False
@@ -263,12 +287,12 @@ class BackEnd:
             self._solve()
 
     def settle(self) -> None:
-        """Solve the graph with all that it holds."""
+        """Solve the graph if it has loops or fixes that no solve has used."""
         if self._unsolved:
             self._solve()
 
     def correction(self) -> Correction:
-        """Return the correction of all keyframes so far, as the last solve left it."""
+        """Return the correction of all keyframes so far, by the last solve."""
         T_world_enu = np.eye(4)
         if self._keyframes and self._aligned:
             T_world_enu = levelled_onto(self._poses[0], self._keyframes[0].T_odom_imu)
@@ -301,7 +325,7 @@ class BackEnd:
         self._poses = np.concatenate([self._poses, pose[None]])
 
     def _close_loops(self, closer: FindsLoops) -> bool:
-        """Add the loops that are found now; return whether one contradicts the poses."""
+        """Add the loops that are found now; return whether one of them contradicts the poses."""
         entering = closer.take(self._keyframes, self._poses)
         for verdict in entering:
             ends = verdict.proposal.target, verdict.proposal.source
@@ -310,7 +334,7 @@ class BackEnd:
         return len(held_by(self._poses, entering)) < len(entering)
 
     def _tie_to_earth(self, gate: GpsGate) -> bool:
-        """Add the newest keyframe's fix; return whether it is the one from which on the heading is known."""
+        """Add the newest keyframe's fix; return whether this fix makes the heading known."""
         keyframe, pose = self._keyframes[-1], self._poses[-1]
         covariance = pose[:3, :3] @ self._since_fix[3:, 3:] @ pose[:3, :3].T if self._aligned else None
         fix = gate.used_fix(keyframe.stamp_ns, keyframe.T_odom_imu, pose, covariance)
@@ -325,7 +349,7 @@ class BackEnd:
         return self._align()
 
     def _align(self) -> bool:
-        """Lay the poses into the fixes' frame, where these tell the heading already."""
+        """Move the poses into the fixes' frame if the heading is observable; return whether it is."""
         poses = self._poses[[index for index, _ in self._fixes]]
         antennas = poses[:, :3, :3] @ self._lever + poses[:, :3, 3]
         positions = np.array([fix.position for _, fix in self._fixes])
@@ -372,7 +396,7 @@ def _position(index: int, fix: Fix, lever: _Array) -> Edge:
 
 
 def _first_pose(T_enu_imu: _Array, tilt_sigma: float) -> Edge:
-    """Return the prior without which fixes along a straight way would leave the roll about it open."""
+    """Return the prior of the first pose: without it, fixes along a straight line leave roll unobservable."""
     information = np.diag([tilt_sigma**-2] * 2 + [_UNKNOWN_YAW**-2] + [_UNKNOWN_POSITION**-2] * 3)
     R = T_enu_imu[:3, :3]
     information[:3, :3] = R.T @ information[:3, :3] @ R

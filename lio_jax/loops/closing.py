@@ -1,4 +1,4 @@
-"""Close loops one keyframe after the other."""
+"""Close loops one keyframe after the other: propose, verify, and accept those that others confirm."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,20 +31,19 @@ _UNCONFIRMED = "no other loop nearby confirms it"
 
 
 class LoopCloser:
-    """What is known of loops so far.
+    """The state of loop closing.
 
-    For each keyframe call :meth:`take`; or :meth:`proposals_for`, ``verify`` and :meth:`settle`, which it is
-    made of.
+    Call :meth:`take` for each keyframe, or its parts :meth:`proposals_for`, ``verify`` and :meth:`settle`.
     """
 
     def __init__(self, settings: BackEndSettings) -> None:
-        """Begin with no keyframe.
+        """Begin without keyframes.
 
         Args:
             settings: ``config.loops`` and ``params.loop``.
 
         Raises:
-            LioJaxError: the file of pairs cannot be read or holds something else.
+            LioJaxError: the file of pairs cannot be read, or a line of it is invalid.
         """
         sizes, limits = settings.run.loops, settings.values["loop"]
         self._settings, self._limits = settings, limits
@@ -52,7 +51,7 @@ class LoopCloser:
         self._consensus = Consensus(limits)
         self._pairs = read_pairs(Path(sizes.pairs)) if sizes.pairs else []
         self._run: list[float] = []
-        """What the odometry has run up to each keyframe, m."""
+        """Length of the odometry's path from the first keyframe to each one, m."""
         self._refused: list[Verdict] = []
         self._without_keyframes: list[Pair] = []
 
@@ -62,18 +61,23 @@ class LoopCloser:
         return list(self._consensus.entered)
 
     def take(self, keyframes: Sequence[Keyframe], poses: NDArray[np.float64]) -> list[Verdict]:
-        """Take up the newest keyframe; return the loops that enter the graph now.
+        """Take the newest keyframe, and return the loops that enter the graph now.
 
         Args:
             keyframes: all so far; each call brings one more.
-            poses: (k, 4, 4) their T_world_imu, corrected so far.
+            poses: (k, 4, 4) their T_world_imu, corrected so far, m.
         """
         proposals = self.proposals_for(keyframes, poses)
         verdicts = [verify(proposal, keyframes, poses, self._settings) for proposal in proposals]
         return self.settle(verdicts, keyframes)
 
     def proposals_for(self, keyframes: Sequence[Keyframe], poses: NDArray[np.float64]) -> list[Proposal]:
-        """Return what the newest keyframe is to be compared with. To be called once for each."""
+        """Return the proposed loops of the newest keyframe. Call it once for each keyframe.
+
+        Args:
+            keyframes: all so far; each call brings one more.
+            poses: (k, 4, 4) their T_world_imu, corrected so far, m.
+        """
         self._places.add(keyframes[-1])
         step = keyframes[-1].T_odom_imu[:3, 3] - keyframes[-2 if len(keyframes) > 1 else -1].T_odom_imu[:3, 3]
         self._run.append(self._run[-1] + float(np.linalg.norm(step)) if self._run else 0.0)
@@ -88,7 +92,12 @@ class LoopCloser:
         return proposals
 
     def settle(self, verdicts: Sequence[Verdict], keyframes: Sequence[Keyframe]) -> list[Verdict]:
-        """Take up the verdicts on the newest proposals; return the loops that enter the graph now."""
+        """Take the verdicts on the newest proposals, and return the loops that enter the graph now.
+
+        Args:
+            verdicts: one for each proposal.
+            keyframes: all so far.
+        """
         run = np.array(self._run)
         self._refused += [verdict for verdict in verdicts if not verdict.accepted]
         accepted = [verdict for verdict in verdicts if verdict.accepted]
@@ -126,22 +135,27 @@ class LoopCloser:
         return [external_proposal(source, target, pair.T_earlier_later, poses, metres, self._limits)]
 
     def outcomes(self) -> list[Verdict]:
-        """Return every proposal so far with what became of it, by its newer keyframe."""
+        """Return the verdicts on all proposals so far, ordered by the newer keyframe."""
         waiting = [replace(loop, accepted=False, reason=_UNCONFIRMED) for loop in self._consensus.waiting]
         every = [*self._consensus.entered, *waiting, *self._refused]
         return sorted(every, key=lambda verdict: verdict.proposal.source)
 
     def untried(self) -> list[Pair]:
-        """Return pairs from outside that belong to no two keyframes so far."""
+        """Return the pairs of the file that belong to no two keyframes so far."""
         return [*self._without_keyframes, *self._pairs]
 
 
 def held_by(poses: NDArray[np.float64], loops: Sequence[Verdict]) -> list[tuple[int, int]]:
-    """Return the ends of the loops that poses agree with: neither ignored so far nor distrusted by the graph.
+    """Return the two keyframes of each loop that agrees with the poses.
+
+    A loop does not agree if no solve has used it yet, or if the graph rejected it.
 
     Args:
-        poses: (k, 4, 4) T_world_imu.
-        loops: that entered the graph.
+        poses: (k, 4, 4) T_world_imu, m.
+        loops: loops that entered the graph.
+
+    Returns:
+        The indices of the newer and the older keyframe of each such loop.
     """
     if not loops:
         return []

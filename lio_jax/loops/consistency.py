@@ -1,8 +1,8 @@
-"""Let loops into the graph that others confirm: each pair of loops makes a circle with odometry between them.
+"""Accept loops that other loops confirm: two loops and the odometry between their ends make a closed circle.
 
-Pairwise consistency (Mangelson, Dominic, Eustice & Vasudevan, "Pairwise consistent measurement set
-maximization for robust multi-robot map merging", ICRA 2018), decided as the loops come: only loops near each
-other are compared, whose circle holds so little odometry that drift says next to nothing.
+The test is pairwise consistency (Mangelson, Dominic, Eustice & Vasudevan, "Pairwise consistent measurement
+set maximization for robust multi-robot map merging", ICRA 2018), in the order in which the loops are found.
+Only loops near each other are compared: their circle contains little odometry, so drift hardly affects it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,14 +16,14 @@ from lio_jax.loops.proposals import possible_error
 from lio_jax.loops.verification import Verdict
 
 _SUPPORT = 2
-"""Loops nearby that have to confirm one."""
+"""Least number of near loops that have to confirm a loop."""
 
 
 class Consensus:
-    """Verified loops: those in the graph, and those that wait for others."""
+    """Verified loops: those in the graph, and those that wait for confirmation."""
 
     def __init__(self, limits: Mapping[str, Any]) -> None:
-        """Begin with none.
+        """Begin without loops.
 
         Args:
             limits: ``params.loop`` as plain numbers.
@@ -34,22 +34,27 @@ class Consensus:
         self._doubtful: list[int] = []
 
     def doubt(self, source: int) -> None:
-        """Note a keyframe that looks like several places, or was found to be in several: a loop in its
-        neighbourhood has to be confirmed by more others than there are of them."""
+        """Note a keyframe that looks like several places, or that was aligned with several.
+
+        Each such keyframe near a loop counts as a loop that contradicts it.
+
+        Args:
+            source: index of the keyframe.
+        """
         self._doubtful.append(source)
 
     def with_loop(
         self, loop: Verdict, keyframes: Sequence[Keyframe], run: NDArray[np.float64]
     ) -> list[Verdict]:
-        """Take up a verified loop; return those that enter the graph now, it among them or not.
+        """Take a verified loop, and return the loops that enter the graph now, possibly this one among them.
 
-        A loop enters when at least two near it agree with it and fewer contradict it. One from outside needs
-        no others, but none may contradict it.
+        A loop enters when at least two near loops agree with it, and more agree than contradict it. A loop
+        from a file needs no confirmation if none contradicts it.
 
         Args:
-            loop: accepted by :func:`~lio_jax.loops.verification.verify`.
+            loop: a loop that :func:`~lio_jax.loops.verification.verify` accepted.
             keyframes: all so far.
-            run: (k,) what the odometry has run up to each, m.
+            run: (k,) length of the odometry's path from the first keyframe to each one, m.
         """
         self.waiting.append(loop)
         entering = [waiting for waiting in self.waiting if self._confirmed(waiting, keyframes, run)]
@@ -84,9 +89,9 @@ def consistent(
 
     Args:
         a: one loop.
-        b: the other.
+        b: the other loop.
         keyframes: all so far.
-        run: (k,) what the odometry has run up to each, m.
+        run: (k,) length of the odometry's path from the first keyframe to each one, m.
         limits: ``params.loop`` as plain numbers.
     """
     odometry = [
@@ -103,7 +108,7 @@ def consistent(
 
 
 def _legs(a: Verdict, b: Verdict, run: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the odometry between the sources and between the targets of two loops, m."""
+    """Return the length of the odometry between the sources and between the targets of two loops, m."""
     return (
         float(abs(run[a.proposal.source] - run[b.proposal.source])),
         float(abs(run[a.proposal.target] - run[b.proposal.target])),

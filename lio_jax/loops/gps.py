@@ -1,4 +1,8 @@
-"""GPS fixes: which are used, how far they are trusted, and how their frame is aligned with the odometry."""
+"""GPS fixes: the choice of those that are used, their covariances, and the alignment of their frame.
+
+:class:`GpsGate` chooses a fix for each keyframe. :func:`alignment` finds the yaw and the translation between
+the odometry's frame and the fixes' frame once the yaw is observable.
+"""
 
 from collections import Counter, deque
 from collections.abc import Mapping
@@ -15,37 +19,41 @@ from lio_jax.pose_graph.graduated import truncated_weights
 _Array = NDArray[np.float64]
 
 _CONFIDENCE = 0.99
-"""Share of right fixes whose squared whitened residual is below the limit."""
+"""Share of correct fixes whose squared whitened residual is below the limit."""
 _MEDIAN = float(chi2.median(3))
+"""Median of the squared whitened residual of a correct fix."""
 _GROWTH = 1.4
-"""Of the control parameter, from one set of weights to the next."""
+"""Factor of the control parameter from one set of weights to the next."""
 _ROUNDS = 100
+"""Largest number of sets of weights."""
 _STEPS = 3
-"""Of Gauss-Newton, behind the closed form."""
+"""Number of Gauss-Newton steps after the closed form."""
 _SETTLED = 1e-3
-"""Weights this near to 0 or 1 change no more."""
+"""Distance from 0 or 1 below which a weight counts as final."""
 _MOST_ALIKE = 0.98
-"""Larger correlations of one residual with the next are not told apart."""
+"""Largest correlation of one residual with the next that is used."""
 
 
 class Alignment(NamedTuple):
     """The level frame of the odometry in the fixes' frame."""
 
     T_enu_odom: _Array
-    """(4, 4); turned about the vertical only."""
+    """(4, 4) pose of the odometry's frame in the fixes' frame, m; its rotation is about the vertical."""
     covariance: _Array
-    """(4, 4) of yaw (rad) and of the odometry's origin to the east, north and up (m)."""
+    """(4, 4) covariance of yaw (rad) and of the odometry's origin to the east, north and up (m)."""
     inlier: NDArray[np.bool_]
-    """(k,) fixes that agree with it."""
+    """(k,) True for fixes that agree with the alignment."""
 
 
 class _Pairs(NamedTuple):
     """Positions of the antenna in both frames."""
 
     odometry: _Array
+    """(k, 3) positions by the odometry, m."""
     fix: _Array
+    """(k, 3) positions of the fixes, m."""
     root: _Array
-    """(k, 3, 3) L of each fix's information L L'."""
+    """(k, 3, 3) factor L of each fix's information L L'."""
 
     def residual(self, yaw: float, shift: _Array) -> _Array:
         """Return (k, 3) whitened residuals L' (Rz(yaw) p + t - f)."""
@@ -53,7 +61,7 @@ class _Pairs(NamedTuple):
         return np.asarray(np.einsum("kji,kj->ki", self.root, missed))
 
     def slope(self, yaw: float) -> _Array:
-        """Return their (k, 3, 4) derivatives by yaw and t."""
+        """Return the (k, 3, 4) derivatives of the whitened residuals by yaw and t."""
         turned = self.odometry @ _about_z(yaw).T
         by_yaw = np.stack([-turned[:, 1], turned[:, 0], np.zeros(len(turned))], -1)
         by_yaw = np.einsum("kji,kj->ki", self.root, by_yaw)
@@ -63,21 +71,22 @@ class _Pairs(NamedTuple):
 def alignment(
     positions_odom: _Array, fixes: _Array, covariances: _Array, yaw_sigma: float
 ) -> Alignment | None:
-    """Return the yaw and translation that lay an odometry onto fixes; None while the yaw is not observable.
+    """Return the yaw and translation that align an odometry with fixes; None while the yaw is not observable.
 
-    Least sum of r' C^-1 r with r = Rz(yaw) p + t - f, truncated for fixes that contradict the others, by
-    graduated non-convexity like a pose graph's edges (Yang et al., RA-L 2020). The covariance counts by how
-    much residuals are larger than stated, and that errors of fixes follow each other: by (1 + a) / (1 - a),
-    with a the correlation of one residual with the next.
+    The alignment minimises the sum of r' C^-1 r with r = Rz(yaw) p + t - f. The terms of fixes that
+    contradict the others are truncated, by graduated non-convexity (Yang et al., RA-L 2020). The covariance
+    is multiplied by the ratio of the residuals' variance to the stated one if that is above one, and by (1 +
+    a) / (1 - a), because the errors of fixes are correlated; a is the correlation of one residual with the
+    next.
 
-    Not observable is a yaw whose standard deviation is above ``yaw_sigma``, or on which not even half of the
-    fixes agree.
+    The yaw counts as not observable if its standard deviation is above ``yaw_sigma``, or if fewer than half
+    of the fixes agree with it.
 
     Args:
-        positions_odom: (k, 3) m, of the antenna by the odometry, z up; in order of time.
-        fixes: (k, 3) m, east north up.
-        covariances: (k, 3, 3) m^2 of the fixes, positive definite.
-        yaw_sigma: rad.
+        positions_odom: (k, 3) positions of the antenna by the odometry, m, z up, in order of time.
+        fixes: (k, 3) positions of the fixes, m, east, north, up.
+        covariances: (k, 3, 3) covariances of the fixes, m^2, positive definite.
+        yaw_sigma: largest standard deviation of an observable yaw, rad.
     """
     if len(fixes) < 2:
         return None
@@ -95,17 +104,17 @@ def alignment(
 
 
 def _robust(pairs: _Pairs) -> tuple[float, _Array, _Array]:
-    """Return yaw, shift and the weights of the pairs, 0 or 1 but for a few."""
+    """Return yaw (rad), translation (m) and the weights of the pairs, rarely between 0 and 1."""
     limit = float(chi2.ppf(_CONFIDENCE, 3))
     weights = np.ones(len(pairs.fix))
     control = 0.0
     for _ in range(_ROUNDS):
         yaw, shift = _solved(pairs, weights)
         squared = np.sum(pairs.residual(yaw, shift) ** 2, -1)
-        # before, all may be small: then it is their ratios that count
+        # before the last rounds all weights may be small, and only their ratios matter
         if control >= 1 and np.all(np.minimum(weights, 1 - weights) < _SETTLED):
             break
-        # errors may be larger than stated for all: then it is their spread that tells which one is wrong
+        # all errors may be larger than stated: the limit grows with their median
         share = squared / (limit * max(1.0, float(np.median(squared)) / _MEDIAN))
         largest = float(share.max())
         if not control:
@@ -118,7 +127,7 @@ def _robust(pairs: _Pairs) -> tuple[float, _Array, _Array]:
 
 
 def _solved(pairs: _Pairs, weights: _Array) -> tuple[float, _Array]:
-    """Return yaw and shift of least squares: in closed form for round covariances, then by Gauss-Newton."""
+    """Return yaw and translation by least squares: closed form for round covariances, then Gauss-Newton."""
     p, f = pairs.odometry, pairs.fix
     share = weights * np.sum(pairs.root[:, :2, :2] ** 2, axis=(1, 2))
     share = share / share.sum()
@@ -134,7 +143,7 @@ def _solved(pairs: _Pairs, weights: _Array) -> tuple[float, _Array]:
 
 
 def _covariance(pairs: _Pairs, inlier: NDArray[np.bool_], yaw: float, shift: _Array) -> _Array | None:
-    """Return (4, 4) of yaw and shift, None where the yaw is open."""
+    """Return the (4, 4) covariance of yaw and translation; None if the yaw is not observable."""
     A = pairs.slope(yaw)[inlier].reshape(-1, 4)
     scale = np.linalg.norm(A, axis=0) + np.finfo(float).tiny
     _, singular, right = np.linalg.svd(A / scale, full_matrices=False)
@@ -147,7 +156,7 @@ def _covariance(pairs: _Pairs, inlier: NDArray[np.bool_], yaw: float, shift: _Ar
 
 
 def _alike(residual: _Array) -> float:
-    """Return of how many residuals in a row one alone says as much, if correlation fades by a factor."""
+    """Return the factor by which first-order autoregressive correlation increases the variance of a mean."""
     power = float(np.sum(residual**2))
     if power == 0:
         return 1.0
@@ -161,16 +170,16 @@ def _about_z(yaw: float) -> _Array:
 
 
 _WITNESSES = 20
-"""So many of the latest fixes say whether the next one is possible."""
+"""Number of earlier fixes with which a new fix is compared."""
 
 
 class Fix(NamedTuple):
-    """Where the antenna was at a keyframe."""
+    """The measured position of the antenna at a keyframe."""
 
     position: _Array
-    """(3,) m, in the fixes' frame: east, north, up."""
+    """(3,) position in the fixes' frame, m: east, north, up."""
     covariance: _Array
-    """(3, 3) m^2."""
+    """(3, 3) covariance of the position, m^2."""
 
 
 class Refusal(StrEnum):
@@ -192,7 +201,7 @@ class _Witness:
 
 
 class GpsGate:
-    """Chooses keyframe by keyframe, in order; each choice depends on the keyframes until then alone."""
+    """The choice of a fix for each keyframe, in order; a choice depends on earlier keyframes only."""
 
     def __init__(
         self,
@@ -205,11 +214,11 @@ class GpsGate:
         """Take a recording's fixes.
 
         Args:
-            stamp_ns: (m,) ascending.
-            position: (m, 3) m, east north up, of the antenna.
-            covariance: (m, 3, 3) m^2, positive definite.
-            values: numbers of :class:`lio_jax.loops.params.GpsParams` by name.
-            elevation: whether the fixes' height counts; false: the height is that of the keyframe's pose.
+            stamp_ns: (m,) times of the fixes, ns, ascending.
+            position: (m, 3) positions of the antenna, m, east, north, up.
+            covariance: (m, 3, 3) covariances of the positions, m^2, positive definite.
+            values: values of :class:`lio_jax.loops.params.GpsParams` by name.
+            elevation: True: the fixes' height is used. False: the height is that of the keyframe's pose.
         """
         self._stamp_ns, self._position, self._covariance = stamp_ns, position, covariance
         self._values = values
@@ -221,18 +230,20 @@ class GpsGate:
         self._last_used: _Array | None = None
         self._witnesses: deque[_Witness] = deque(maxlen=_WITNESSES)
         self.refusals: Counter[Refusal] = Counter()
-        """How many keyframes got no fix, by reason."""
+        """Number of keyframes without a fix, by reason."""
 
     def used_fix(
         self, stamp_ns: int, T_odom_imu: _Array, T_world_imu: _Array, pose_covariance: _Array | None = None
     ) -> Fix | Refusal:
-        """Return the fix that the next keyframe is tied to, or why there is none.
+        """Return the fix of the next keyframe, or the reason why it has none.
 
         Args:
-            stamp_ns: of the keyframe.
-            T_odom_imu: (4, 4) its pose by the smooth odometry, which says how far the vehicle moved.
-            T_world_imu: (4, 4) its pose as corrected so far; its height counts where the fixes' does not.
-            pose_covariance: (3, 3) m^2 of its position in the fixes' frame; None: nothing ties it there yet.
+            stamp_ns: time of the keyframe, ns.
+            T_odom_imu: (4, 4) its pose by the odometry without corrections, m, which measures the distance
+                travelled.
+            T_world_imu: (4, 4) its pose, corrected so far, m; its height is used if that of the fixes is not.
+            pose_covariance: (3, 3) covariance of its position in the fixes' frame, m^2; None before the
+                alignment.
         """
         antenna = T_odom_imu[:3, :3] @ self._lever + T_odom_imu[:3, 3]
         self._move(stamp_ns, antenna)
@@ -275,7 +286,7 @@ class GpsGate:
         return fix if possible else Refusal.JUMP
 
     def _at(self, stamp_ns: int) -> Fix | None:
-        """Return the fix at a time: between two, or the nearest one, less certain by what was moved since."""
+        """Return the fix at a time: interpolated, or the nearest one with the distance travelled as error."""
         later = int(np.searchsorted(self._stamp_ns, stamp_ns))
         around = [k for k in (later - 1, later) if 0 <= k < len(self._stamp_ns)]
         away = [abs(int(self._stamp_ns[k]) - stamp_ns) * 1e-9 for k in around]
@@ -284,14 +295,14 @@ class GpsGate:
         if len(around) == 2 and self._one_way(around, sum(away)):
             share = away[0] / sum(away)
             weights = np.array([1 - share, share])
-            # their errors are taken as one: they hardly change from one fix to the next
+            # the errors of both are taken as equal, because they hardly change from one fix to the next
             return Fix(weights @ self._position[around], np.tensordot(weights, self._covariance[around], 1))
         nearest = around[int(np.argmin(away))]
         missed = (self._speed * min(away)) ** 2
         return Fix(self._position[nearest], self._covariance[nearest] + missed * np.eye(3))
 
     def _one_way(self, around: list[int], seconds: float) -> bool:
-        """Return whether the vehicle can have gone from one fix to the next one."""
+        """Return whether the vehicle can have travelled from one fix to the next one."""
         if seconds > self._values["interpolation"]:
             return False
         moved = _apart(*self._position[around])
@@ -302,7 +313,7 @@ class GpsGate:
         return bool(moved - self._speed * seconds <= self._values["jump_sigmas"] * np.sqrt(variance))
 
     def _trusted(self, fix: Fix, height: float) -> Fix:
-        """Return the fix with no smaller variance than is believed, and with the height that counts."""
+        """Return the fix with at least the smallest allowed variance, and with the height that is used."""
         position, covariance = fix.position.copy(), fix.covariance.copy()
         if not self._elevation:
             position[2] = height
@@ -316,7 +327,7 @@ class GpsGate:
         return not self._witnesses or 2 * fitting > len(self._witnesses)
 
     def _fit(self, one: _Witness, other: _Witness) -> bool:
-        # without elevation both heights are the odometry's own and say nothing
+        # without elevation both heights are the odometry's own and contain no information
         axes = slice(3 if self._elevation else 2)
         by_fixes = _apart(one.fix.position[axes], other.fix.position[axes])
         by_odometry = _apart(one.antenna[axes], other.antenna[axes])

@@ -1,4 +1,4 @@
-"""Keyframes of the back end, and the local cloud that several of them make up."""
+"""Keyframes of the back end, and local clouds from the points of several keyframes."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -9,18 +9,19 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A pose of the odometry and what was seen there."""
+    """A pose of the odometry with the points of its scan."""
 
     index: int
-    """Its place among the keyframes."""
+    """Number of the keyframe, from 0."""
     stamp_ns: int
-    """Of the scan's end."""
+    """Time of the scan's end, ns."""
     T_odom_imu: NDArray[np.float64]
-    """(4, 4) by the smooth odometry, z up."""
+    """(4, 4) pose by the odometry without corrections, m, z up."""
     points: NDArray[np.float32]
-    """(n, 3) m, in the IMU frame at the stamp, thinned."""
+    """(n, 3) thinned points, m, in the IMU frame at the stamp."""
     covariance: NDArray[np.float64]
-    """(6, 6) of the pose's error since the keyframe before, right perturbation, rotation (rad) first."""
+    """(6, 6) covariance of the pose's error since the previous keyframe: right perturbation, rotation (rad)
+    before translation (m)."""
 
 
 def level_points(
@@ -30,14 +31,14 @@ def level_points(
     members: Iterable[int],
     reach: float,
 ) -> NDArray[np.float32]:
-    """Return the points of some keyframes in the world's axes from one keyframe's position, (n, 3) m.
+    """Return the points of some keyframes, (n, 3) m, in world axes with the origin at one keyframe.
 
     Args:
-        keyframes: all of them.
-        poses: (k, 4, 4) T_world_imu.
-        centre: the one that is the origin.
-        members: those whose points are wanted.
-        reach: points farther than this from the origin in plan are left out, m.
+        keyframes: all keyframes.
+        poses: (k, 4, 4) T_world_imu, m.
+        centre: index of the keyframe at the origin.
+        members: indices of the keyframes whose points are returned.
+        reach: largest |x| and |y| of a returned point, m.
     """
     clouds = []
     for k in members:
@@ -49,7 +50,7 @@ def level_points(
 
 
 def thinned(points: NDArray[np.float32], spacing: float) -> NDArray[np.float32]:
-    """Return one point of each cube, in an order that is the same wherever the points are cut off.
+    """Return one point of each cube, in pseudo-random order: any first part of them covers all of space.
 
     Args:
         points: (n, 3) m.
@@ -57,13 +58,18 @@ def thinned(points: NDArray[np.float32], spacing: float) -> NDArray[np.float32]:
     """
     cube = np.floor(points / spacing).astype(np.int64) & 0x1FFFFF
     key = (cube[:, 0] << 42) | (cube[:, 1] << 21) | cube[:, 2]
-    # a multiplier scatters the keys: a prefix of the sorted ones is spread over all of space
+    # a multiplier scatters the keys, so that the first ones in sorted order are spread over all of space
     _, first = np.unique(key * np.int64(0x9E3779B97F4A7C15 - (1 << 64)), return_index=True)
     return points[first]
 
 
 def padded(points: NDArray[np.float32], capacity: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return as many of the points as there is room for, zeros after them, and which rows are points."""
+    """Return the first points, padded with zeros, and a mask of the real rows.
+
+    Args:
+        points: (n, 3) m.
+        capacity: number of returned rows.
+    """
     rows = np.zeros((capacity, 3), np.float32)
     count = min(len(points), capacity)
     rows[:count] = points[:count]

@@ -1,4 +1,4 @@
-"""How well two places overlap: shares of agreeing points, contradictions, compared candidates."""
+"""How well two places overlap: the share of points that agree, and the share that contradict."""
 
 from dataclasses import dataclass
 
@@ -10,29 +10,37 @@ from lio_jax.loops.alignment import Alignments
 from lio_jax.pose_graph.graph import heading_of
 
 _NEAR = 1.0
-"""Farther than this from the map a point has no counterpart there, m."""
+"""Distance from the map's points beyond which a point has no counterpart, m."""
 _BIN = np.deg2rad(4.0)
-"""Of the view from the sensor: a keyframe's points are thinned, and what lies near is as sparse as this."""
+"""Size of a bin of the sensor's view, rad: thinned points near the sensor are as far apart as this."""
 _SEEN_THROUGH = 2.0
-"""So far before the nearest point that was seen in a direction nothing can have stood, m."""
+"""Distance before the nearest measured point of a direction from which on space is taken as empty, m."""
 _VIEW = (3.0, 40.0)
-"""Ranges at which the map's points are looked for in the view, m."""
+"""Smallest and largest range of the map's points that are compared with the view, m."""
 
 
 class Agreement:
-    """Points of a map, arranged to be found by place."""
+    """Points of a map, in a tree for nearest neighbours."""
 
     def __init__(self, target: NDArray[np.float32]) -> None:
-        """Arrange a map's points, (m, 3) m."""
+        """Build the tree of a map's points, (m, 3) m."""
         self._tree = cKDTree(target, balanced_tree=False, compact_nodes=False)
 
     def distances(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return each point's distance to the nearest of the map's, infinite beyond 1 m, (n,) m."""
+        """Return the (n,) distances to the nearest point of the map, m; infinite beyond 1 m.
+
+        Args:
+            points: (n, 3) m, in the map's frame.
+        """
         return np.asarray(self._tree.query(points, distance_upper_bound=_NEAR)[0])
 
 
 def fitness_of(distances: NDArray[np.float64]) -> float:
-    """Return the mean squared distance of the points that have a counterpart, m^2; infinite if none has."""
+    """Return the mean squared distance of the points that have a counterpart, m^2; infinite if none has one.
+
+    Args:
+        distances: (n,) m, infinite for points without a counterpart.
+    """
     near = distances[np.isfinite(distances)]
     return float(np.mean(near**2)) if len(near) else np.inf
 
@@ -40,15 +48,15 @@ def fitness_of(distances: NDArray[np.float64]) -> float:
 def conflict(
     seen: NDArray[np.float32], target: NDArray[np.float32], T_target_source: NDArray[np.float64]
 ) -> float:
-    """Return the share of a map's points, of those in view, that stand where a keyframe saw through.
+    """Return the share of a map's visible points that lie in space which a keyframe measured as empty.
 
-    In view are those at or before what the keyframe saw in the same direction; what is behind that may be
-    hidden and says nothing.
+    A point of the map is visible if it is not farther than what the keyframe measured in the same direction.
+    Points behind that may be occluded, so they are not counted.
 
     Args:
-        seen: (n, 3) m, of one keyframe, from its sensor.
-        target: (m, 3) m, of things that would hide what is behind them.
-        T_target_source: (4, 4).
+        seen: (n, 3) points of one keyframe, m, from its sensor.
+        target: (m, 3) points of the map on objects that occlude what is behind them, m.
+        T_target_source: (4, 4) pose of the keyframe in the map's frame, m.
     """
     rotation, position = T_target_source[:3, :3], T_target_source[:3, 3]
     columns, rows = round(2 * np.pi / _BIN), round(np.pi / _BIN)
@@ -66,7 +74,7 @@ def conflict(
 def _directions(
     points: NDArray[np.floating], columns: int, rows: int
 ) -> tuple[NDArray[np.int64], NDArray[np.floating]]:
-    """Return in which bin of the view points lie, and their distance, m."""
+    """Return the bin of the view in which each point lies, and its distance, m."""
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
     column = np.floor((azimuth / (2 * np.pi) + 0.5) * columns).astype(np.int64) % columns
@@ -77,47 +85,57 @@ def _directions(
 _Array = NDArray[np.float64]
 
 _SEEN_WELL = 25.0
-"""Only what is nearer than this to a keyframe of the target is judged, m: the rest was seen thinly."""
+"""Largest distance of a compared point from the target's keyframes, m: farther away the map is too sparse."""
 LEAST_POINTS = 100
-"""Points of upright things without which there is nothing to compare."""
+"""Least number of points on upright objects for a comparison."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An alignment and what speaks for it, in level axes."""
+    """An alignment with its scores, in level axes."""
 
     T_target_source: _Array
+    """(4, 4) aligned pose, m."""
     information: _Array
+    """(6, 6) inverse covariance of its right perturbation, rotation (rad) before translation (m)."""
     degenerate: bool
+    """True if a direction is not observable."""
     overlap: float
+    """Share of the source's points that agree with the target, 0 to 1."""
     fitness: float
+    """Mean squared distance of the points that have a counterpart, m^2."""
     shift: float
-    """From where the poses so far have the source, m."""
+    """Distance of the source's aligned position from its current one, m."""
     turn: float
-    """From the heading they have, rad."""
+    """Angle between the source's aligned heading and its current one, rad."""
     tilt: float
-    """Against the vertical they have, rad."""
+    """Angle between the source's aligned vertical and its current one, rad."""
 
 
 class Comparison:
-    """The surroundings of two keyframes, to be compared under any alignment."""
+    """The surroundings of two keyframes, which can be compared under any alignment."""
 
     def __init__(
         self, theirs: NDArray[np.float32], stations: _Array, ours: NDArray[np.float32], within: float
     ) -> None:
-        """Take what both saw, and where.
+        """Take the points of target and source.
 
         Args:
-            theirs: (m, 3) m, in the target's level axes.
-            stations: (k, 3) m, where the target's keyframes were.
-            ours: (n, 3) m, of upright things in the source's level axes.
-            within: a point agrees if theirs has one nearer than this, m.
+            theirs: (m, 3) points of the target, m, in its level axes.
+            stations: (k, 3) positions of the target's keyframes, m, in the same axes.
+            ours: (n, 3) points on upright objects of the source, m, in its level axes.
+            within: largest distance to a target's point at which a source's point agrees, m.
         """
         self._agreement, self._stations = Agreement(theirs), cKDTree(stations)
         self._ours, self._within = ours, within
 
     def candidates(self, result: Alignments, poses: _Array) -> list[Candidate]:
-        """Return the alignments that converged, the one that agrees best first."""
+        """Return the alignments that converged, ordered by decreasing overlap.
+
+        Args:
+            result: alignments in level axes.
+            poses: (2, 4, 4) current T_world_imu of the target and of the source, m.
+        """
         offset = poses[1, :3, 3] - poses[0, :3, 3]
         candidates = []
         for row in np.flatnonzero(result.converged):

@@ -1,10 +1,11 @@
-"""Recognise places by what stands around the sensor, whatever the drift in between.
+"""Recognise places by the objects around the sensor, independently of drift.
 
-Scan context (Kim & Kim, "Scan Context: egocentric spatial descriptor for place recognition within 3D point
-cloud map", IROS 2018): the height of the highest point in each cell of a polar grid. Differences to the
-paper: axes are the world's, so that the odometry's heading says which turns are possible; the newest keyframe
-is also described as seen from some metres to its sides, for a pass in another lane; and the earlier places
-with a similar key are compared at all turns at once, by products of Fourier transforms.
+The descriptor is Scan Context (Kim & Kim, "Scan Context: egocentric spatial descriptor for place recognition
+within 3D point cloud map", IROS 2018): the height of the highest point in each cell of a polar grid. There
+are three differences to the paper. The axes are those of the world, so that the odometry's heading limits the
+possible rotations. The newest keyframe is also described from some metres to its sides, for a second pass in
+another lane. The places with the most similar keys are compared at all rotations at once, by products of
+Fourier transforms.
 """
 
 from dataclasses import dataclass
@@ -18,44 +19,45 @@ from lio_jax.loops.keyframe import Keyframe
 _Array = NDArray[np.floating]
 
 _BELOW = 2.5
-"""The ground is less than this below the sensor, m: heights count from there."""
+"""Height of the origin of heights below the sensor, m: the ground is less than this below it."""
 _ASIDE = (0.0, -4.0, 4.0)
-"""To the left of the newest keyframe, m: where it is described from."""
+"""Places from which the newest keyframe is described, m to its left."""
 _COMPARED = 300
-"""Places at most that are compared in full: those with the most similar key, their mean over the sectors."""
+"""Largest number of places that are compared in full: those with the most similar key, the descriptor's mean
+over the sectors."""
 _LEAST_SHARE = 0.5
-"""Places have nothing in common where fewer columns than this share are common to both."""
+"""Least share of columns that both places fill; for a smaller share the distance increases."""
 
 
 @dataclass(frozen=True)
 class Likeness:
-    """How much one place is like others."""
+    """The similarity of the last keyframe's place to the places of n others."""
 
     index: NDArray[np.int64]
-    """(n,) of the other keyframes."""
+    """(n,) indices of the other keyframes."""
     distance: NDArray[np.float64]
-    """(n,) 0: the same, 1: nothing in common."""
+    """(n,) distances of the descriptors: 0 for equal ones, 1 for ones with nothing in common."""
     turn: NDArray[np.float64]
-    """(n,) by which the one has to be turned in the world's axes to look like the other, rad."""
+    """(n,) rotation of the last keyframe about the world's z axis at which it is most similar, rad."""
     aside: NDArray[np.float64]
-    """(n,) to the left of the one keyframe: where it looks most like the other, m."""
+    """(n,) place to the left of the last keyframe from which it is most similar, m."""
 
     def among(self, chosen: NDArray[np.bool_]) -> "Likeness":
-        """Return some of the rows."""
+        """Return the rows of an (n,) mask."""
         return Likeness(self.index[chosen], self.distance[chosen], self.turn[chosen], self.aside[chosen])
 
     def T_target_source(self, row: int, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the last keyframe's pose in another's frame, (4, 4), as far as the likeness tells.
+        """Return the pose of the last keyframe in another's frame, (4, 4) m, that the similarity implies.
 
         Args:
-            row: of this table.
-            poses: (k, 4, 4) T_world_imu that the places were compared with.
+            row: row of this table.
+            poses: (k, 4, 4) T_world_imu, m, with which the places were compared.
         """
         cos, sin = np.cos(self.turn[row]), np.sin(self.turn[row])
         target = poses[self.index[row]]
         turned = np.eye(4)
         turned[:3, :3] = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ poses[-1, :3, :3]
-        # the place aside of the source is where the target is
+        # the place to the side of the source coincides with the target
         turned[:3, 3] = target[:3, 3] - self.aside[row] * turned[:3, 1]
         return np.linalg.inv(target) @ turned
 
@@ -64,12 +66,12 @@ class Places:
     """The descriptors of all keyframes so far."""
 
     def __init__(self, rings: int, sectors: int, reach: float) -> None:
-        """Begin with none.
+        """Begin without descriptors.
 
         Args:
-            rings: of the polar grid.
-            sectors: of the polar grid.
-            reach: farthest points that count, m.
+            rings: number of rings of the polar grid.
+            sectors: number of sectors of the polar grid.
+            reach: radius of the polar grid, m.
         """
         self._shape, self._reach = (rings, sectors), reach
         # frequency first: a matrix product for each
@@ -79,7 +81,7 @@ class Places:
         self._newest = self._spectra[:, :0]
 
     def add(self, keyframe: Keyframe) -> None:
-        """Describe the next keyframe."""
+        """Add the descriptor of the next keyframe."""
         if self._count == self._spectra.shape[1]:
             self._spectra = np.concatenate([self._spectra, np.zeros_like(self._spectra)], axis=1)
             self._heading = np.concatenate([self._heading, np.zeros_like(self._heading)])
@@ -94,12 +96,12 @@ class Places:
     def compared(
         self, poses: NDArray[np.float64], index: NDArray[np.int64], heading_error: NDArray[np.float64]
     ) -> Likeness:
-        """Return how much the newest place is like others.
+        """Return the similarity of the newest place to others.
 
         Args:
-            poses: (k, 4, 4) T_world_imu of all keyframes, corrected so far.
-            index: (m,) of the others.
-            heading_error: (m,) by how much the heading between the two may be wrong, rad.
+            poses: (k, 4, 4) T_world_imu of all keyframes, corrected so far, m.
+            index: (m,) indices of the others.
+            heading_error: (m,) largest error of the heading between the newest keyframe and each other, rad.
         """
         rings, sectors = self._shape
         # the zeroth frequency is the sum over the sectors
@@ -112,15 +114,15 @@ class Places:
         newest = self._newest.conj()
         alike = np.matmul(others[..., :rings], newest[..., :rings].transpose(0, 2, 1))
         both = others[..., rings:] * newest[..., rings:].transpose(0, 2, 1)
-        # of the turn, the other keyframe and the place aside
+        # axes: the rotation, the other keyframe, and the place to the side
         cosines, columns = (irfft(spectrum, sectors, axis=0) for spectrum in (alike, both))
         distance = 1 - cosines / np.maximum(columns, _LEAST_SHARE * sectors)
 
-        # what the corrections have turned since the places were described
+        # rotations by corrections since the places were described
         since = _headings(poses[: self._count]) - self._heading[: self._count]
         turn = 2 * np.pi * np.arange(sectors)[:, None] / sectors + since[index] - since[-1]
         turn = (turn + np.pi) % (2 * np.pi) - np.pi
-        # half a sector more, so that one is left
+        # half a sector more, so that at least one rotation is left
         possible = np.abs(turn) <= heading_error + np.pi / sectors
         distance = np.where(possible[:, :, None], distance, np.inf).astype(np.float64)
         rows = np.arange(len(index))
@@ -131,13 +133,13 @@ class Places:
 
 
 def polar_image(points: _Array, rings: int, sectors: int, reach: float) -> _Array:
-    """Return the height of the highest point in each cell, (rings, sectors) m above the ground about.
+    """Return the height of the highest point in each cell, (rings, sectors) m, from near the ground.
 
     Args:
         points: (n, 3) m, from the sensor, z up.
-        rings: equally wide.
-        sectors: counterclockwise from x.
-        reach: of the outermost ring, m.
+        rings: number of rings of equal width.
+        sectors: number of sectors, counterclockwise from x.
+        reach: outer radius of the outermost ring, m.
     """
     away = np.hypot(points[:, 0], points[:, 1])
     points, away = points[away < reach], away[away < reach]
@@ -150,9 +152,9 @@ def polar_image(points: _Array, rings: int, sectors: int, reach: float) -> _Arra
 
 
 def _spectra(images: _Array) -> NDArray[np.complex64]:
-    """Return the transforms around the circle of (m, rings, sectors), (frequencies, m, rings + 1).
+    """Return (frequencies, m, rings + 1) Fourier transforms, along sectors, of (m, rings, sectors) images.
 
-    Columns are of unit length, so that products are cosines; the last ring says which columns hold anything.
+    Columns have unit length, so products are cosines. The extra ring is 1 for columns that are not empty.
     """
     length = np.linalg.norm(images, axis=1, keepdims=True)
     seen = length > 0

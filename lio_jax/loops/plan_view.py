@@ -1,8 +1,8 @@
-"""How two places may fit on each other, seen from above: upright things in a grid, all shifts at once.
+"""Find all fits of one place on another, seen from above, with upright objects in a grid.
 
-Correlative scan matching (Olson, "Real-time correlative scan matching", ICRA 2009) with the shifts of each
-turn found together by Fourier transforms. It needs no guess nearer than its window and shows every fit, not
-only the nearest: rivals of the best one tell of places that repeat themselves.
+The method is correlative scan matching (Olson, "Real-time correlative scan matching", ICRA 2009), where
+Fourier transforms evaluate all shifts of a rotation at once. It needs a guess only within its window, and it
+finds every fit and not only the nearest one. Several good fits indicate a place with repeated structure.
 """
 
 from typing import NamedTuple
@@ -15,44 +15,45 @@ from scipy.ndimage import gaussian_filter
 _Array = NDArray[np.floating]
 
 CELL = 1.0
-"""Of the grid, m."""
+"""Edge of a cell of the grid, m."""
 _SIDE = 128
-"""Cells of the grid."""
+"""Number of cells along an edge of the grid."""
 WINDOW = 16
-"""Largest shift either way, cells: at the grid's edge so many are left for it."""
+"""Largest shift in each direction, cells; the grid has a margin of this width around the source."""
 SOURCE_REACH = (_SIDE // 2 - WINDOW) * CELL
-"""Of the points that are shifted, m ..."""
+"""Largest |x| and |y| of the source's points, m."""
 TARGET_REACH = _SIDE // 2 * CELL
-"""... and of those they are laid upon."""
+"""Largest |x| and |y| of the target's points, m."""
 _UPRIGHT = (0.4, 2.0)
-"""Differences of height within a cell from which a thing is upright, and from which it counts in full, m."""
+"""Differences of height within a cell, m, at which an object begins to count as upright, and counts fully."""
 _TURN = 0.05
-"""Between the turns that are tried, rad."""
+"""Step of the rotations that are tried, rad."""
 _APART = 3.0
-"""Fits nearer to a better one than this are the same fit, m."""
+"""Least distance between two different fits, m."""
 _BLUR = 0.8
-"""Of the grid that is laid upon, cells: half a cell and half a turn's step are lost otherwise."""
+"""Standard deviation of the target's blur, cells: it allows for half a cell and half a step of rotation."""
 
 
 class Fits(NamedTuple):
-    """Shifts and turns of the source at which it fits on the target, the best first."""
+    """The n best fits of the source on the target, the best first."""
 
     turn: _Array
-    """(n,) rad, about z."""
+    """(n,) rotations of the source about z, rad."""
     shift: _Array
-    """(n, 2) m."""
+    """(n, 2) positions of the source's origin in the target, m."""
     share: _Array
-    """(n,) of the source's upright things that have such under them, 0 to 1."""
+    """(n,) share of the source's upright objects that lie on upright objects of the target, 0 to 1."""
 
 
 def upright_cells(points: NDArray[np.float32]) -> tuple[_Array, NDArray[np.bool_]]:
-    """Return how much each cell of the grid holds of upright things, and which points belong to them.
+    """Return how upright the content of each cell of the grid is, and which points are in upright cells.
 
     Args:
-        points: (n, 3) m, within ``TARGET_REACH`` of the origin in plan, z up.
+        points: (n, 3) m, z up, with |x| and |y| below ``TARGET_REACH``.
 
     Returns:
-        (cells, cells) from 0 to 1, by x and y, the origin being the corner of the four cells in the middle.
+        The (cells, cells) values from 0 to 1, by x and y, with the origin at the corner of the four cells in
+        the middle; and an (n,) mask of the points in cells above 0.
     """
     x, y = (np.floor(points[:, :2] / CELL).astype(np.int64) + _SIDE // 2).T
     low, high = np.full((_SIDE, _SIDE), np.inf, np.float32), np.full((_SIDE, _SIDE), -np.inf, np.float32)
@@ -76,13 +77,13 @@ def fits(
     """Return the best fits of one grid on another near a guess.
 
     Args:
-        source: (cells, cells) of things within ``SOURCE_REACH``.
-        target: (cells, cells).
-        turn: guess, rad.
-        turn_error: by how much it may be wrong, rad.
-        shift: (2,) guess, m: where the source's origin lies in the target; within the window.
-        shift_error: by how much it may be wrong, m.
-        most: number of fits at most.
+        source: (cells, cells) upright objects within ``SOURCE_REACH``, see :func:`upright_cells`.
+        target: (cells, cells) upright objects within ``TARGET_REACH``.
+        turn: guess of the source's rotation about z, rad.
+        turn_error: largest error of ``turn``, rad.
+        shift: (2,) guess of the source's origin in the target, m, within the window.
+        shift_error: largest error of ``shift``, m.
+        most: largest number of fits.
     """
     steps = int(np.ceil(turn_error / _TURN))
     turns = turn + _TURN * np.arange(-steps, steps + 1)

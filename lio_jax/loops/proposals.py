@@ -1,4 +1,8 @@
-"""Pairs of keyframes that may show the same place: by distance, by descriptor, from a file."""
+"""Pairs of keyframes that may show the same place: near by distance, similar by descriptor, or from a file.
+
+The length of the odometry between two keyframes bounds the error of their relative pose, and so the places
+that are possible. Closed loops shorten that length.
+"""
 
 import math
 from bisect import bisect_right
@@ -19,27 +23,27 @@ from lio_jax.loops.keyframe import Keyframe
 from lio_jax.loops.place_descriptor import Likeness, Places
 
 _ACROSS = 1.0
-"""A closed loop is as sure as this much odometry, m."""
+"""Length of odometry that has the same uncertainty as a closed loop, m."""
 
 
 class Error(NamedTuple):
-    """Largest error of a relative pose that is believed."""
+    """The largest possible error of relative poses."""
 
     position: NDArray[np.float64]
-    """m."""
+    """Largest error of the position, m."""
     heading: NDArray[np.float64]
-    """rad."""
+    """Largest error of the heading, rad."""
 
 
 AT_LEAST = Error(np.array(1.0), np.array(0.1))
-"""What is possible however short the way: the keyframes' clouds are thinned."""
+"""Possible error of a relative pose after no odometry, because the keyframes' clouds are thinned."""
 
 
 def possible_error(metres: NDArray[np.float64] | float, limits: Mapping[str, Any]) -> Error:
-    """Return how wrong relative poses may be after so many metres of odometry.
+    """Return the largest possible error of relative poses after some metres of odometry.
 
     Args:
-        metres: run between the two poses.
+        metres: length of the odometry between the two poses, m.
         limits: ``params.loop`` as plain numbers.
     """
     run = np.asarray(metres, np.float64)
@@ -51,14 +55,14 @@ def possible_error(metres: NDArray[np.float64] | float, limits: Mapping[str, Any
 def metres_from(
     source: int, run: NDArray[np.float64], closed: Sequence[tuple[int, int]]
 ) -> NDArray[np.float64]:
-    """Return the odometry between a keyframe and every other along the shortest way, (k,) m.
+    """Return the (k,) length of the odometry between a keyframe and every keyframe by the shortest path, m.
 
-    A way may take closed loops as short cuts: after one the drift begins anew.
+    A path may pass through closed loops, which stop the drift.
 
     Args:
-        source: number of the keyframe.
-        run: (k,) what the odometry has run up to each, m.
-        closed: pairs of keyframes that loops tie together.
+        source: index of the keyframe.
+        run: (k,) length of the odometry's path from the first keyframe to each one, m.
+        closed: pairs of keyframes between which a loop is closed.
     """
     count = len(run)
     if not closed:
@@ -66,9 +70,9 @@ def metres_from(
     first = np.arange(count - 1)
     loops = np.array(closed, np.int64).reshape(-1, 2)
     rows, columns = np.concatenate([first, loops[:, 0]]), np.concatenate([first + 1, loops[:, 1]])
-    # a sum of none would be no edge at all
+    # a sparse matrix takes a length of zero as no edge
     lengths = np.concatenate([np.maximum(np.diff(run), 1e-6), np.full(len(loops), _ACROSS)])
-    # of edges given twice a sparse matrix takes the sum
+    # a sparse matrix adds the lengths of an edge that is given twice
     key, index = np.unique(rows * count + columns, return_index=True)
     ways = csr_array((lengths[index], (key // count, key % count)), shape=(count, count))
     return dijkstra(ways, directed=False, indices=[source])[0]
@@ -79,26 +83,33 @@ _FORM = "time_a time_b [x y z qx qy qz qw]"
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """One line of the file."""
+    """Two times at one place, from one line of the file."""
 
     line: int
+    """Number of the line, from 1."""
     earlier_ns: int
+    """Earlier time, ns."""
     later_ns: int
+    """Later time, ns."""
     T_earlier_later: NDArray[np.float64] | None
-    """(4, 4) guess of the later pose in the earlier one's frame."""
+    """(4, 4) guess of the later pose in the earlier one's frame, m; None if the line has none."""
 
 
 def read_pairs(path: Path) -> list[Pair]:
-    """Read lines ``time_a time_b [x y z qx qy qz qw]``: s, m, pose T_a_b of the body at b in its frame at a.
+    """Read lines ``time_a time_b [x y z qx qy qz qw]``.
 
-    Commas may separate the numbers; ``#`` begins a comment. The two times may come in either order.
+    The times are in s. The pose T_a_b, in m, is that of the body at time b in its frame at time a. Commas may
+    separate the numbers, and ``#`` begins a comment. The two times may come in either order.
+
+    Args:
+        path: path of the file.
 
     Returns:
-        The pairs by their later time.
+        The pairs, ordered by their later time.
 
     Raises:
-        UsageError: there is no such file.
-        LioJaxError: a line is something else; the message names it.
+        UsageError: the file cannot be opened.
+        LioJaxError: a line has another form; the message names it.
     """
     try:
         text = path.read_text()
@@ -117,14 +128,13 @@ def read_pairs(path: Path) -> list[Pair]:
 
 
 def keyframe_at(keyframes: Sequence[Keyframe], stamp_ns: int) -> int | None:
-    """Return the last keyframe up to a time: had the body moved away, there would be a later one.
+    """Return the index of the last keyframe at or before a time; None before the first keyframe.
+
+    The body is near that keyframe at the time: otherwise there would be a later keyframe.
 
     Args:
-        keyframes: all up to the time, at least.
-        stamp_ns: the time.
-
-    Returns:
-        Its index; None before the first.
+        keyframes: at least all keyframes up to the time.
+        stamp_ns: the time, ns.
     """
     after = bisect_right(keyframes, stamp_ns, key=lambda keyframe: keyframe.stamp_ns)
     return after - 1 if after else None
@@ -166,15 +176,16 @@ def _pose(values: list[float], place: str) -> NDArray[np.float64]:
 Origin = Literal["radius", "descriptor", "external"]
 
 _SHARE_OF_RADIUS = 0.5
-"""Places whose distance may be wrong by more than this share of the radius are also sought by descriptor."""
+"""Possible error of a place, as a share of the radius, above which it is also searched by descriptor."""
 _RIVAL = 1.25
-"""A second place is compared if its descriptor differs by no more than this many times the best one's."""
+"""Largest descriptor distance of a second place that is proposed too, over that of the best place."""
 _TWIN = 1.1
-"""The same for places that are out of the question: they make the best one doubtful without comparison."""
+"""Largest descriptor distance of an impossible place that makes the best place doubtful, over that of the
+best place."""
 _DESCRIBED_SHIFT = 12.0
-"""By how much the place of the keyframe that looks most alike may be off, m."""
+"""Largest error of a position that follows from a descriptor, m."""
 _GUESSED_TURN = 0.25
-"""By how much a described or a given heading may be off, rad."""
+"""Largest error of a heading from a descriptor or from a file, rad."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,20 +197,27 @@ class Proposal:
     target: int
     """Index of the older keyframe."""
     origin: Origin
+    """How the pair was found."""
     T_target_source: NDArray[np.float64]
-    """(4, 4) first guess."""
+    """(4, 4) first guess of the newer pose in the older one's frame, m."""
     shift_error: float
-    """By how much the guess may be wrong in position, m ..."""
+    """Largest error of the guess in position, m."""
     turn_error: float
-    """... and in heading, rad."""
+    """Largest error of the guess in heading, rad."""
     metres: float
-    """Of odometry between the two along the shortest way, closed loops being short cuts."""
+    """Length of the odometry between the two by the shortest path, which may pass through closed loops, m."""
     twin: int | None = None
-    """Another keyframe that looks as much alike, where the odometry cannot have been."""
+    """Index of another keyframe that is as similar, but too far away for the odometry's error; or None."""
 
 
 def is_old(keyframes: Sequence[Keyframe], source: int, time_gap: float) -> NDArray[np.bool_]:
-    """Return which keyframes are older than one of them by more than ``time_gap`` s, (k,)."""
+    """Return the (k,) mask of keyframes that are older than one of them by more than a time.
+
+    Args:
+        keyframes: all so far.
+        source: index of the keyframe with which the others are compared.
+        time_gap: least difference of age, s.
+    """
     stamps = np.array([keyframe.stamp_ns for keyframe in keyframes])
     return (stamps[source] - stamps) > time_gap * 1e9
 
@@ -213,9 +231,9 @@ def nearest_proposal(
     """Return the newest keyframe with the nearest old one, if there is one within the radius.
 
     Args:
-        poses: (k, 4, 4) T_world_imu of all keyframes, corrected so far.
-        old: (k,) which may be compared with the last.
-        metres: (k,) of odometry between each and the last.
+        poses: (k, 4, 4) T_world_imu of all keyframes, corrected so far, m.
+        old: (k,) True for keyframes that may be compared with the last.
+        metres: (k,) length of the odometry between each keyframe and the last, m.
         limits: ``params.loop`` as plain numbers.
     """
     distance = np.where(old, np.linalg.norm(poses[:, :3, 3] - poses[-1, :3, 3], axis=1), np.inf)
@@ -240,14 +258,14 @@ def external_proposal(
     metres: float,
     limits: Mapping[str, Any],
 ) -> Proposal:
-    """Return two keyframes that something else proposed.
+    """Return the proposal of two keyframes from a file.
 
     Args:
-        source: index of the newer one.
-        target: index of the older one.
-        T_target_source: (4, 4) guess; None: the same place, with the heading that the odometry has.
-        poses: (k, 4, 4) T_world_imu of all keyframes, corrected so far.
-        metres: of odometry between the two.
+        source: index of the newer keyframe.
+        target: index of the older keyframe.
+        T_target_source: (4, 4) guess, m; None: the same position, with the heading by the odometry.
+        poses: (k, 4, 4) T_world_imu of all keyframes, corrected so far, m.
+        metres: length of the odometry between the two, m.
         limits: ``params.loop`` as plain numbers.
     """
     turn_error = _GUESSED_TURN
@@ -265,17 +283,18 @@ def described_proposals(
     metres: NDArray[np.float64],
     limits: Mapping[str, Any],
 ) -> list[Proposal]:
-    """Return the newest keyframe with the old one that looks most alike, where drift may hide its distance.
+    """Return the newest keyframe with the most similar old one whose distance drift makes uncertain.
 
-    It is compared with all old places, for a place that looks like several is no evidence of any. Another one
-    about as much alike that may be the right one as well is proposed too: both being accepted with different
-    results tells that they are too similar. One that cannot be the right one is noted as a twin.
+    The newest place is compared with all old places, because a place that is similar to several is no
+    evidence for one of them. A second place that is about as similar, and that is possible, is proposed too:
+    if both are accepted with different results, they are too similar. A second place that is not possible is
+    noted as a twin.
 
     Args:
         places: descriptors of all keyframes.
-        poses: (k, 4, 4) T_world_imu of all keyframes, corrected so far.
-        old: (k,) which may be compared with the last.
-        metres: (k,) of odometry between each and the last.
+        poses: (k, 4, 4) T_world_imu of all keyframes, corrected so far, m.
+        old: (k,) True for keyframes that may be compared with the last.
+        metres: (k,) length of the odometry between each keyframe and the last, m.
         limits: ``params.loop`` as plain numbers.
     """
     error = possible_error(metres, limits)

@@ -1,9 +1,10 @@
-"""Decide whether two keyframes saw the same place, and how they lie to each other.
+"""Decide whether two keyframes saw the same place, and find their relative pose.
 
-Both are compared with what surrounds them: all fits of one on the other that the odometry's possible error
-allows are found from above, aligned, and judged. A loop is accepted if one fit agrees, nothing stands where
-the scan saw through, no direction is left open and no other fit comes near it. The last two refuse places
-that repeat themselves.
+Each keyframe is taken with the keyframes around it. All fits of one on the other within the odometry's
+possible error are found in a view from above, aligned in space, and compared. A loop is accepted if one fit
+agrees with enough points, if the map has few points in space that the scan measured as empty, if all
+directions are observable, and if no other fit agrees nearly as well. The last two conditions reject repeated
+structure.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,44 +31,47 @@ from lio_jax.pose_graph.graph import heading_of
 _Array = NDArray[np.float64]
 
 _SPACING = 0.4
-"""Of the points that are aligned, m."""
+"""Edge of the cubes to which the aligned points are thinned, m."""
 _SCALE: float = numbers_of(AlignmentParams)["registration"]["information_scale"]
 """Share of the information that is believed where the recipe declares none."""
 _OTHER_FIT = (2.0, 0.15)
-"""Two fits are not the same if they are farther apart than this, m and rad."""
+"""Distances, m and rad, above which two fits are different."""
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What became of a proposal."""
+    """The decision on a proposal."""
 
     proposal: Proposal
+    """The proposed loop."""
     accepted: bool
+    """Whether the two keyframes saw the same place."""
     reason: str
-    """Why, in words, for a reader."""
+    """Reason of the decision, in words."""
     T_target_source: _Array
-    """(4, 4) as aligned; the guess where nothing was."""
+    """(4, 4) aligned pose of the newer keyframe in the older one's frame, m; the guess if not aligned."""
     information: _Array
-    """(6, 6) inverse covariance of its right perturbation, rotation (rad) first; zeros where refused."""
+    """(6, 6) inverse covariance of its right perturbation, rotation (rad) before translation (m); zero if the
+    loop was refused."""
     fitness: float = np.inf
-    """Mean squared distance to the map of the points that have it near, m^2."""
+    """Mean squared distance to the map of the points that have a counterpart there, m^2."""
     overlap: float = 0.0
-    """Share of points of upright things that agree with the map."""
+    """Share of the points on upright objects that agree with the map, 0 to 1."""
     conflict: float = 0.0
-    """Share of the map's upright things in view that stand where the scan saw through."""
+    """Share of the map's visible upright points that lie in space measured as empty, 0 to 1."""
     rival: float = 0.0
-    """Points that agree with the best other fit, as a share of those that agree with this one."""
+    """Overlap of the best different fit, as a share of this one's."""
 
 
 def verify(
     proposal: Proposal, keyframes: Sequence[Keyframe], poses: _Array, settings: BackEndSettings
 ) -> Verdict:
-    """Return whether a proposed loop holds.
+    """Return the decision on a proposed loop.
 
     Args:
-        proposal: which two keyframes.
+        proposal: the two keyframes, with a guess.
         keyframes: all so far.
-        poses: (k, 4, 4) their T_world_imu, corrected so far.
+        poses: (k, 4, 4) their T_world_imu, corrected so far, m.
         settings: ``config.loops`` and ``params.loop``.
     """
     limits, sizes = settings.values["loop"], settings.run.loops
@@ -183,19 +187,24 @@ def _judged(
 
 
 def refused(proposal: Proposal, reason: str) -> Verdict:
-    """Return the verdict on a proposal that was not even aligned."""
+    """Return the verdict on a proposal that is refused before an alignment.
+
+    Args:
+        proposal: the two keyframes, with a guess.
+        reason: reason of the refusal, in words.
+    """
     return Verdict(proposal, False, reason, proposal.T_target_source, np.zeros((6, 6)))
 
 
 def _believed(information: _Array, limits: Mapping[str, Any], scale: float) -> _Array:
-    """Return the information that is left where neighbouring points share the map's error."""
+    """Return the information reduced for correlated errors: neighbouring points share the map's error."""
     sigmas = np.repeat([limits["rotation_sigma"], limits["translation_sigma"]], 3)
     believed = np.linalg.inv(np.linalg.inv(scale * information) + np.diag(sigmas**2))
     return (believed + believed.T) / 2
 
 
 def _level(T_target_source: _Array, T_world_target: _Array, T_world_source: _Array) -> _Array:
-    """Return a relative pose between two keyframes' level axes: those of the world that their poses imply."""
+    """Return a relative pose between two keyframes' level axes: the world axes that their poses imply."""
     level = np.eye(4)
     level[:3, :3] = T_world_target[:3, :3] @ T_target_source[:3, :3] @ T_world_source[:3, :3].T
     level[:3, 3] = T_world_target[:3, :3] @ T_target_source[:3, 3]
@@ -203,11 +212,11 @@ def _level(T_target_source: _Array, T_world_target: _Array, T_world_source: _Arr
 
 
 def _guesses(found: Fits, targets: _Array) -> _Array:
-    """Return the fits' poses, at the height of the nearest of the target's keyframes, (n, 4, 4).
+    """Return the (n, 4, 4) poses of the fits, m, at the height of the nearest of the target's keyframes.
 
     Args:
-        found: in level axes.
-        targets: (k, 3) their positions, m.
+        found: fits in level axes.
+        targets: (k, 3) positions of the target's keyframes, m.
     """
     guesses = np.tile(np.eye(4), (len(found.turn), 1, 1))
     guesses[:, :3, :3] = Rotation.from_euler("z", found.turn[:, None]).as_matrix()
@@ -219,7 +228,7 @@ def _guesses(found: Fits, targets: _Array) -> _Array:
 
 @cache
 def _params(voxel_size: float, dtype: jnp.dtype) -> AlignmentParams:
-    """Return parameters of the alignment, which is the same whatever the recipe."""
+    """Return the parameters of the alignment, which do not depend on the recipe."""
     size = jnp.asarray(voxel_size, dtype)
     return eqx.tree_at(lambda params: params.map.voxel_size, traced(AlignmentParams), size)
 

@@ -6,18 +6,27 @@ from jaxtyping import Array, Bool, Int32
 from lio_jax.core.hashing import voxel_hash
 
 WAYS = 2
-"""Slots a key may lie in: neighbours in memory, so that both are read together."""
+"""Number of slots that a key may lie in. They are neighbours in memory, so that both are read together."""
 FREE = -(2**31)
-"""Coordinate that no key has."""
+"""Coordinate of a free slot, which no key has."""
 
 
 def free_keys(capacity: int) -> Int32[Array, "c 3"]:
-    """Return the keys of ``capacity`` free slots (a power of two)."""
+    """Return the keys of a table of free slots.
+
+    Args:
+        capacity: number of slots, a power of two.
+    """
     return jnp.full((capacity, 3), FREE, jnp.int32)
 
 
 def find_slots(keys: Int32[Array, "c 3"], wanted: Int32[Array, "*b 3"]) -> Int32[Array, "*b"]:
-    """Return the slot that holds each wanted key, -1 where none does."""
+    """Return the slot that holds each wanted key; -1 where no slot does.
+
+    Args:
+        keys: the keys in the table's c slots.
+        wanted: keys to look up.
+    """
     first = _first_slot(keys, wanted)
     slot = jnp.full(wanted.shape[:-1], -1, jnp.int32)
     for way in range(WAYS):
@@ -30,15 +39,16 @@ def find_slots(keys: Int32[Array, "c 3"], wanted: Int32[Array, "*b 3"]) -> Int32
 def claim_slots(
     keys: Int32[Array, "c 3"], wanted: Int32[Array, "m 3"], mask: Bool[Array, " m"]
 ) -> tuple[Int32[Array, "c 3"], Int32[Array, " m"]]:
-    """Find a slot for each wanted key, in a free one where no slot holds it yet.
+    """Find the slot of each wanted key, and claim a free slot for a key that the table does not hold yet.
 
     Args:
-        keys: of the table.
-        wanted: repetitions are allowed: they get the same slot.
-        mask: which rows are real.
+        keys: the keys in the table's c slots.
+        wanted: keys to find or to add; equal keys get the same slot.
+        mask: which rows of ``wanted`` are real.
 
     Returns:
-        The table's keys thereafter, and the slots: -1 for masked rows and where both ways were taken.
+        The table's keys afterwards, and the slot of each wanted key. The slot is -1 for masked rows, and
+        where both slots of a key belong to others.
     """
     capacity = keys.shape[0]
     order = jnp.arange(wanted.shape[0], dtype=jnp.int32)
@@ -47,7 +57,7 @@ def claim_slots(
     for way in range(WAYS):
         candidate = first + way
         asks = mask & (slot < 0) & (_take(keys, (candidate, 0)) == FREE)
-        # of the keys that ask for one slot the last row's gets it
+        # if several keys ask for one slot, the key in the last row gets it
         claims = jnp.full(capacity, -1, jnp.int32)
         claims = claims.at[jnp.where(asks, candidate, capacity)].max(order, mode="drop")
         winner = _take(claims, candidate)

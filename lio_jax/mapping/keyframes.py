@@ -1,7 +1,7 @@
 """Keyframes with their clouds, and which of them the map should hold (LIO-SAM's surrounding keyframes).
 
-Shan et al., "LIO-SAM: Tightly-coupled lidar inertial odometry via smoothing and mapping", IROS 2020, section
-III.C, as its program selects them: near ones, one per so many metres, and the latest.
+Source: Shan et al., "LIO-SAM: Tightly-coupled lidar inertial odometry via smoothing and mapping", IROS 2020,
+section III.C, with the choice of its program: the near keyframes, thinned to a spacing, and the latest ones.
 """
 
 import equinox as eqx
@@ -14,36 +14,51 @@ from lio_jax.mapping.params import SubmapParams
 
 
 class KeyframeCloud(eqx.Module):
-    """A scan's corners and surface points, m, lidar frame of the instant its pose refers to."""
+    """A scan's corners and surface points, in the lidar frame at the instant of its pose."""
 
     corner: Float32[Array, "c 3"]
+    """Corners, m."""
     corner_mask: Bool[Array, " c"]
+    """True where a corner is real."""
     surface: Float32[Array, "s 3"]
+    """Surface points, m."""
     surface_mask: Bool[Array, " s"]
+    """True where a surface point is real."""
 
 
 class Keyframes(eqx.Module):
-    """Up to k keyframes; poses are theirs, clouds stay in their own frames."""
+    """Up to k keyframes with their poses; each cloud is in the lidar frame of its keyframe."""
 
     T_world_lidar: jaxlie.SE3
-    """k."""
+    """Poses of the k keyframes, m."""
     time: Float[Array, " k"]
-    """s, on the clock of those who add them; -inf in a free row."""
+    """Time of each keyframe, s, on the caller's clock; -inf in a free row."""
     sparse: Bool[Array, " k"]
-    """Which were the first of their surroundings: the others are used as long as they are recent."""
+    """True for keyframes that were the first within the spacing. The others are used only while they are
+    recent."""
     entered: Bool[Array, " k"]
-    """Which have their points in the map."""
+    """True where the map holds the keyframe's points."""
     corner: Float32[Array, "k c 3"]
+    """Corners of each keyframe, m, the real ones first."""
     surface: Float32[Array, "k s 3"]
+    """Surface points of each keyframe, m, the real ones first."""
     corners: Int32[Array, " k"]
-    """How many of a row's corners are real: they come first."""
+    """Number of real corners of each keyframe."""
     surfaces: Int32[Array, " k"]
+    """Number of real surface points of each keyframe."""
     last: Int32[Array, ""]
-    """Row of the latest, -1 before the first."""
+    """Row of the latest keyframe; -1 before the first one."""
 
 
 def no_keyframes(capacity: int, corners: int, surfaces: int, dtype: jnp.dtype) -> Keyframes:
-    """Return room for so many keyframes with so many points each."""
+    """Return a table without keyframes.
+
+    Args:
+        capacity: largest number of keyframes.
+        corners: capacity for each keyframe's corners.
+        surfaces: capacity for each keyframe's surface points.
+        dtype: dtype of poses and times.
+    """
     identity = jnp.tile(jnp.array([1, 0, 0, 0, 0, 0, 0], dtype), (capacity, 1))
     none = jnp.zeros(capacity, jnp.int32)
     return Keyframes(
@@ -60,7 +75,13 @@ def no_keyframes(capacity: int, corners: int, surfaces: int, dtype: jnp.dtype) -
 
 
 def is_due(keyframes: Keyframes, T_world_lidar: jaxlie.SE3, params: SubmapParams) -> Bool[Array, ""]:
-    """Return whether a pose is far enough from the last keyframe's to become one."""
+    """Return whether a pose is far enough from the last keyframe to become a keyframe.
+
+    Args:
+        keyframes: all so far.
+        T_world_lidar: the pose.
+        params: ``keyframe_distance`` (m) and ``keyframe_angle`` (rad).
+    """
     latest = jaxlie.SE3(keyframes.T_world_lidar.wxyz_xyz[keyframes.last])
     between = latest.inverse() @ T_world_lidar
     moved = jnp.linalg.norm(between.translation()) >= params.keyframe_distance
@@ -76,17 +97,18 @@ def with_keyframe(
     cloud: KeyframeCloud,
     params: SubmapParams,
 ) -> Keyframes:
-    """Return the keyframes with one more, whose points the map is about to get.
+    """Return the keyframes with one more, which counts as entered into the map.
 
-    It takes a free row, else that of the oldest one that is neither sparse nor recent, else the oldest's.
+    The new keyframe takes a free row. If there is none, it replaces the oldest keyframe that is neither
+    sparse nor recent, and if there is none of these, the oldest keyframe.
 
     Args:
-        keyframes: donate them.
-        keep: whether there is one to add.
+        keyframes: all so far; donate them.
+        keep: whether there is a keyframe to add.
         T_world_lidar: its pose.
-        time: s, not before that of the last.
+        time: its time, s, not before that of the last keyframe.
         cloud: its points.
-        params: spacing, and what is recent.
+        params: ``spacing`` (m) of sparse keyframes, and the age ``recent`` (s).
     """
     capacity = len(keyframes.time)
     free = jnp.isinf(keyframes.time)
@@ -116,21 +138,22 @@ def with_keyframe(
 def next_to_enter(
     keyframes: Keyframes, T_world_lidar: jaxlie.SE3, time: Float[Array, ""], params: SubmapParams
 ) -> tuple[Keyframes, jaxlie.SE3, KeyframeCloud]:
-    """Return a keyframe that the map should hold but does not: one that the vehicle comes back to.
+    """Return the nearest keyframe that the map should hold but does not hold any more.
 
     Args:
-        keyframes: donate them.
-        T_world_lidar: where the vehicle is.
-        time: now, s.
-        params: radius, and what is recent.
+        keyframes: all so far; donate them.
+        T_world_lidar: current pose.
+        time: current time, s.
+        params: ``radius`` (m) of the keyframes that the map holds, and the age ``recent`` (s).
 
     Returns:
-        The keyframes with that one marked as entered, its pose and its points, masked where there is none.
+        The keyframes with that one marked as entered, its pose, and its points. All points are masked if
+        there is no such keyframe.
     """
     capacity = len(keyframes.time)
     distance = _distance(keyframes, T_world_lidar)
     near = (distance <= params.radius) & ~jnp.isinf(keyframes.time)
-    # what falls behind may be cleared from the map: it has to enter anew
+    # the map may have cleared the points of keyframes that are far away: these have to enter again
     entered = keyframes.entered & (near | (keyframes.time >= time - params.recent))
     wanted = near & keyframes.sparse & ~entered
     row = jnp.argmin(jnp.where(wanted, distance, jnp.inf))
@@ -155,7 +178,7 @@ def _distance(keyframes: Keyframes, T_world_lidar: jaxlie.SE3) -> Float[Array, "
 def _compacted(
     points: Float32[Array, "n 3"], mask: Bool[Array, " n"]
 ) -> tuple[Float32[Array, "n 3"], Int32[Array, ""]]:
-    """Return the real points first, and their number."""
+    """Return the points with the real ones first, and the number of real ones."""
     count = jnp.cumsum(mask, dtype=jnp.int32)
     place = computed_once(jnp.where(mask, count - 1, len(mask)))
     return jnp.zeros_like(points).at[place].set(points, mode="drop"), count[-1]

@@ -1,7 +1,8 @@
-"""The k nearest points of a :class:`PointMap`, written for the loops that XLA makes of it on a CPU.
+"""The nearest points of a :class:`PointMap` to each query, in a form for which XLA makes fast loops on a CPU.
 
-All candidates of a query come from whole blocks. Each is one integer, its squared distance with the lowest
-bits replaced by its number, and a network of minima and maxima keeps the k smallest, without a sort.
+The candidates of a query are all points of some blocks. Each candidate is one integer: its squared distance,
+with the lowest bits replaced by the candidate's number. A network of minima and maxima keeps the smallest of
+these integers, without a sort.
 """
 
 import itertools
@@ -19,19 +20,22 @@ from lio_jax.mapping.point_map import EDGE, VOXELS, PointMap
 _NEAR = tuple(itertools.product((0, 1), repeat=3))
 _AROUND = tuple(itertools.product((-1, 0, 1), repeat=3))
 _CHUNK = 512
-"""Queries handled at a time: what they gather fits a core's cache, and padding costs little."""
+"""Number of queries of eight blocks at a time: their candidates fit a core's cache, and padding is cheap."""
 _WIDE_CHUNK = 128
+"""Number of queries of 27 blocks at a time."""
 
 
 class Neighbours(eqx.Module):
-    """The n map points nearest each of k queries, in ascending distance; infinite where there are too few."""
+    """The n map points nearest to each of k queries, in ascending distance; infinite if there are too few."""
 
     x: Float32[Array, "n k"]
-    """m, in the anchored frame."""
+    """Coordinate x of each point, m, in the anchored frame."""
     y: Float32[Array, "n k"]
+    """Coordinate y of each point, m, in the anchored frame."""
     z: Float32[Array, "n k"]
+    """Coordinate z of each point, m, in the anchored frame."""
     squared_distance: Float32[Array, "n k"]
-    """m^2."""
+    """Squared distance of each point from the query, m^2."""
 
 
 def nearest_points(
@@ -43,21 +47,21 @@ def nearest_points(
     neighbours: int,
     radius: Float32[Array, ""] | float = jnp.inf,
 ) -> Neighbours:
-    """Return the map points nearest each query.
+    """Return the map points nearest to each query.
 
-    The eight blocks nearest a query are searched. Where a point outside of them might be nearer than the last
-    one found and than the radius, all 27 blocks around it are: neighbours within a block's edge are always
-    right, farther ones are the nearest among those blocks. Distances that agree to a thousandth count as
-    equal.
+    First the eight blocks nearest to a query are searched. If a point outside of them could be nearer than
+    the last one found and nearer than the radius, all 27 blocks around the query are searched. So neighbours
+    within a block's edge are always exact; farther ones are the nearest points of these blocks. Distances
+    that agree to a thousandth count as equal.
 
     Args:
         pmap: the map.
-        points: m, in the frame anchored at ``anchor``.
-        mask: which rows are real; those from the last real one on cost nothing.
+        points: the queries, m, in the frame anchored at ``anchor``.
+        mask: which rows are real; rows after the last real one cost nothing.
         anchor: block whose lower corner is the origin of ``points``.
         voxel_size: edge length of a voxel, m.
-        neighbours: how many per query.
-        radius: farther neighbours need not be the nearest ones, m.
+        neighbours: number of map points for each query.
+        radius: distance beyond which a neighbour need not be the nearest one, m.
     """
     count = points.shape[0]
     edge = EDGE * voxel_size
@@ -70,7 +74,7 @@ def nearest_points(
 
     scaled = points / edge
     fraction = scaled - jnp.floor(scaled)
-    # along each axis the eight blocks end with the query's own block on one side, one later on the other
+    # along each axis the eight blocks cover the query's own block and its neighbour on the nearer side
     sure = edge * jnp.min(jnp.maximum(fraction, 1 - fraction), axis=-1)
     unsure = mask & (jnp.minimum(found.squared_distance[-1], radius**2) > sure**2)
     rank = running_count(unsure) - 1
@@ -79,7 +83,7 @@ def nearest_points(
 
 
 class _Search(eqx.Module):
-    """What all queries share."""
+    """The map and the queries of a search."""
 
     pmap: PointMap
     points: Float32[Array, "k 3"]
@@ -95,7 +99,7 @@ class _Search(eqx.Module):
         blocks: Int32[Array, "b 3"],
         chunk: int,
     ) -> Neighbours:
-        """Search the given blocks for the first ``rows`` queries in ``order``; replace what was found."""
+        """Search some blocks for the first ``rows`` queries in ``order``; replace their earlier results."""
         count = len(order)
 
         def one_chunk(number: Array, found: Neighbours) -> Neighbours:
@@ -107,7 +111,7 @@ class _Search(eqx.Module):
         return jax.lax.fori_loop(0, (rows + chunk - 1) // chunk, one_chunk, found)
 
     def _among(self, points: Float32[Array, "c 3"], blocks: Int32[Array, "b 3"]) -> Neighbours:
-        """Return the nearest points among blocks, given relative to the query's and its nearer side."""
+        """Return the nearest points in some blocks; 1 in ``blocks`` is a step to the query's nearer side."""
         scaled = points / self.edge
         own = jnp.floor(scaled)
         side = jnp.where(scaled - own > 0.5, 1, -1).astype(jnp.int32)
@@ -126,9 +130,9 @@ class _Search(eqx.Module):
             )
             squared = jnp.where(held[:, None] >= 0, squared, jnp.inf)
             key = jax.lax.bitcast_convert_type(squared, jnp.int32) & distance_bits
-            # queries side by side in memory: the network's loops run over them
+            # queries are contiguous in memory: the network's loops run over them
             keys = computed_once((key | (number * VOXELS + jnp.arange(VOXELS, dtype=jnp.int32))).T)
-            # in memory of its own: a loop that reads what it carries is not vectorised
+            # a copy in memory of its own: XLA does not vectorise a loop that reads its own carry
             nearest = computed_once(nearest)
             for candidate in range(VOXELS):
                 nearest = _with_candidate(nearest, keys[candidate])
@@ -136,7 +140,7 @@ class _Search(eqx.Module):
 
         none = jnp.full(len(points), jnp.iinfo(jnp.int32).max)
         keys = jax.lax.fori_loop(0, len(blocks), with_block, (none,) * self.neighbours)
-        # with fewer candidates than neighbours the network's start is left, which is no candidate's number
+        # with fewer candidates than neighbours the network's initial value is left: no candidate's number
         number = jnp.minimum(jnp.stack(keys) & ~distance_bits, len(blocks) * VOXELS - 1)
         which, voxel = number // VOXELS, number % VOXELS
         column = jnp.arange(len(points))
@@ -159,7 +163,7 @@ class _Search(eqx.Module):
 
 
 def _with_candidate(nearest: tuple[Array, ...], key: Array) -> tuple[Array, ...]:
-    """Return the smallest keys in ascending order with one more candidate."""
+    """Return the smallest keys in ascending order, after one more candidate."""
     kept = []
     for smallest in nearest:
         kept.append(jnp.minimum(smallest, key))

@@ -1,9 +1,9 @@
-"""A hashed map of points, one per voxel, inside a cube that follows the sensor (FAST-LIO2's ikd-tree).
+"""A hashed map of points, one per voxel, in a cube that follows the sensor; it replaces FAST-LIO2's ikd-tree.
 
-Voxels are stored in blocks of 3 x 3 x 3, so that one look-up of a key brings 27 of them. Coordinates inside a
-block are kept relative to its centre and blocks as integers, so float32 stays precise however far the vehicle
-drives. Points are given in an *anchored* frame: the world shifted by a whole number of blocks, such that the
-vehicle is near its origin.
+Voxels are stored in blocks of 3 x 3 x 3, so one look-up of a key finds 27 of them. A point's coordinates are
+relative to its block's centre, and blocks have integer coordinates, so float32 is precise at any distance
+from the world's origin. Points are given in an *anchored* frame: the world shifted by a whole number of
+blocks, such that the vehicle is near the origin.
 """
 
 import equinox as eqx
@@ -15,16 +15,16 @@ from lio_jax.core.xla import computed_once
 from lio_jax.mapping.hash_slots import FREE, claim_slots, free_keys
 
 EDGE = 3
-"""Voxels per edge of a block."""
+"""Number of voxels along an edge of a block."""
 VOXELS = EDGE**3
-"""Voxels per block."""
+"""Number of voxels in a block."""
 
 
 class PointMap(eqx.Module):
-    """All blocks, and the cube outside of which nothing is kept."""
+    """All blocks, and the cube that bounds the map."""
 
     block: Int32[Array, "c 3"]
-    """Which block a slot holds; ``FREE`` in a free slot."""
+    """Integer coordinates of the block in each slot; ``FREE`` in a free slot."""
     point: Float32[Array, "c 81"]
     """x of the 27 voxels' points, then y, then z, m from the block's centre; infinite in empty voxels."""
     off_centre: Float32[Array, "c 27"]
@@ -34,16 +34,20 @@ class PointMap(eqx.Module):
 
 
 class Insertion(eqx.Module):
-    """What an insertion did."""
+    """The result of an insertion."""
 
     added: Bool[Array, " m"]
-    """Which points are now in the map."""
+    """True for points that are now in the map."""
     dropped: Int32[Array, ""]
-    """Points whose block found no free slot: the table is too full."""
+    """Number of points whose block found no free slot, because the table is too full."""
 
 
 def empty_map(capacity: int) -> PointMap:
-    """Return a map of ``capacity`` free blocks (a power of two), its cube around the world's origin."""
+    """Return a map of free blocks, with its cube around the world's origin.
+
+    Args:
+        capacity: number of blocks, a power of two.
+    """
     return PointMap(
         block=free_keys(capacity),
         point=jnp.full((capacity, 3 * VOXELS), jnp.inf, jnp.float32),
@@ -55,13 +59,13 @@ def empty_map(capacity: int) -> PointMap:
 def move_cube(
     pmap: PointMap, anchor: Int32[Array, "3"], half_side: Float32[Array, ""], margin: Float32[Array, ""]
 ) -> PointMap:
-    """Move the cube to the sensor along each axis on which a face is near, and delete what falls out.
+    """Move the cube to the sensor along each axis on which a face is near, and delete the points outside.
 
     Args:
-        pmap: donate it.
+        pmap: the map; donate it.
         anchor: the block that the sensor is in.
-        half_side: half the cube's edge, in blocks.
-        margin: the sensor's least distance from a face, in blocks.
+        half_side: half of the cube's edge, blocks.
+        margin: least distance of the sensor from a face, blocks.
     """
     near = jnp.abs(anchor - pmap.cube) > half_side - margin
     return _cleared(pmap, jnp.where(near, anchor, pmap.cube), half_side)
@@ -74,14 +78,14 @@ def shift_box(
     margin: Float32[Array, ""],
     step: Float32[Array, ""],
 ) -> PointMap:
-    """Shift a box, which takes the cube's place, by as many steps as keep its faces away from the sensor.
+    """Shift a box in place of the cube, in whole steps, until no face is too near to the sensor.
 
     Args:
-        pmap: donate it.
+        pmap: the map; donate it.
         anchor: the block that the sensor is in.
-        half_sides: half the box's edges along x, y and z, in blocks.
-        margin: the sensor's least distance from a face, in blocks.
-        step: in blocks; the box's centre is a multiple of it, rounded to a block.
+        half_sides: half of the box's edges along x, y and z, blocks.
+        margin: least distance of the sensor from a face, blocks.
+        step: blocks; the box's centre is a multiple of it, rounded to a block.
     """
     number = jnp.round(pmap.cube / step)
     away = anchor - number * step
@@ -91,7 +95,7 @@ def shift_box(
 
 
 def _cleared(pmap: PointMap, centre: Int32[Array, "3"], half_sides: Float32[Array, "*d"]) -> PointMap:
-    """Return the map around another block, without what lies outside."""
+    """Return the map with its cube or box around another block, without the blocks outside."""
 
     def cleared(_: Array, pmap: PointMap) -> PointMap:
         gone = ~_inside(pmap.block, centre, half_sides)[:, None]
@@ -102,7 +106,7 @@ def _cleared(pmap: PointMap, centre: Int32[Array, "3"], half_sides: Float32[Arra
             centre,
         )
 
-    # a loop of no or one turn works in place, where a conditional would copy the map each time
+    # a loop of zero or one turns works in place; a conditional would copy the map each time
     return jax.lax.fori_loop(0, jnp.any(centre != pmap.cube).astype(jnp.int32), cleared, pmap)
 
 
@@ -115,16 +119,16 @@ def insert(
     half_side: Float32[Array, "*d"],
     nearer_by: Float32[Array, ""],
 ) -> tuple[PointMap, Insertion]:
-    """Keep, of each voxel, the point nearest its centre: the one held or one of ``points``.
+    """Keep in each voxel the point nearest to its centre: the one that the map holds, or one of ``points``.
 
     Args:
-        pmap: donate it.
+        pmap: the map; donate it.
         points: m, in the frame anchored at ``anchor``.
         mask: which rows are real.
         anchor: block whose lower corner is the origin of ``points``.
         voxel_size: edge length of a voxel, m.
-        half_side: half the cube's edge, in blocks: points outside are left out. Of a box, three of them.
-        nearer_by: a point held is replaced by one that is nearer by more than this, m.
+        half_side: half of the cube's edge, or of the box's three edges, blocks; points outside are left out.
+        nearer_by: a new point replaces the old one if it is nearer to the centre by more than this, m.
     """
     capacity = pmap.block.shape[0]
     points = points.astype(jnp.float32)
@@ -157,7 +161,7 @@ def _inside(
 ) -> Bool[Array, " m"]:
     """Return which blocks lie in the cube, or in the box."""
     half_sides = jnp.broadcast_to(half_side, 3)
-    # in floats, because a free slot's coordinates would overflow; they count as outside
+    # as floats, because the integer coordinates of a free slot would overflow; free slots count as outside
     x, y, z = (
         jnp.abs(block[:, i].astype(jnp.float32) - cube[i].astype(jnp.float32)) <= half_sides[i]
         for i in range(3)

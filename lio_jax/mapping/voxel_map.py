@@ -1,8 +1,8 @@
-"""A hashed voxel table of fixed capacity: the running distribution of the points in each voxel and its plane.
+"""A hashed voxel table of fixed capacity: mean, covariance and plane of the points in each voxel.
 
-Coordinates inside a voxel are kept relative to its centre and voxel coordinates as integers, so float32 stays
-precise however far the vehicle drives. Points are given in an *anchored* frame: the world shifted by a whole
-number of voxels, such that the vehicle is near its origin.
+A point's coordinates are relative to its voxel's centre, and voxels have integer coordinates, so float32 is
+precise at any distance from the world's origin. Points are given in an *anchored* frame: the world shifted by
+a whole number of voxels, such that the vehicle is near the origin.
 """
 
 import equinox as eqx
@@ -17,58 +17,64 @@ from lio_jax.core.prefix_sum import running_count
 from lio_jax.core.xla import computed_once
 
 WAYS = 2
-"""Slots a voxel may lie in: neighbours in memory, so that both are read together."""
+"""Number of slots that a voxel may lie in. They are neighbours in memory, so that both are read together."""
 FREE = -(2**31)
-"""Coordinate that no voxel has."""
+"""Coordinate of a free slot, which no voxel has."""
 SUBDIVISION = 4
-"""Cells per voxel edge; each cell takes one point, remembered in 4 x 4 x 4 = 64 bits."""
+"""Number of cells along a voxel's edge. Each cell takes one point, so 4 x 4 x 4 = 64 bits show which are
+filled."""
 _BATCH = 4096
-"""Points inserted at a time: most scans bring fewer new ones, and pay for no more."""
+"""Number of points inserted at a time. Most scans have fewer new points, and need one batch."""
 _OFFSETS = np.concatenate([np.zeros((1, 3), np.int32), np.eye(3, dtype=np.int32)])
-"""To a point's own voxel and one neighbour along each axis."""
+"""Offsets to a point's own voxel and to one neighbour along each axis."""
 
 
 class VoxelMap(eqx.Module):
-    """All slots."""
+    """A table of c slots, each of which holds one voxel."""
 
     voxel: Int32[Array, "c 3"]
-    """Which voxel a slot holds; ``FREE`` in a free slot."""
+    """Integer coordinates of the voxel in each slot; ``FREE`` in a free slot."""
     moments: Float32[Array, "c 10"]
-    """Count; sums of x y z; sums of xx yy zz xy xz yz; m, relative to the voxel's centre."""
+    """Number of points; sums of x, y and z (m); sums of xx, yy, zz, xy, xz and yz (m^2); coordinates are
+    relative to the voxel's centre."""
     cells: UInt32[Array, "c 2"]
     """Bit set of the cells that hold a point."""
     centroid: Float32[Array, "c 4"]
-    """Mean relative to the voxel's centre, m, and count: what a look-up compares."""
+    """Mean of the points relative to the voxel's centre, m, and their number. A look-up compares these."""
     plane: Float32[Array, "c 5"]
-    """Unit normal and the two smaller variances, ascending, m^2: what a match uses."""
+    """Unit normal, and the two smaller variances, ascending, m^2. A match uses these."""
 
 
 class Insertion(eqx.Module):
-    """What an insertion did."""
+    """The result of an insertion."""
 
     added: Bool[Array, " m"]
-    """Which points filled an empty cell."""
+    """True for points that filled an empty cell."""
     dropped: Int32[Array, ""]
-    """Points whose voxel found no free slot: the table is too full."""
+    """Number of points whose voxel found no free slot, because the table is too full."""
 
 
 class Planes(eqx.Module):
-    """The map's distribution around each query, seen as a plane."""
+    """The plane and the distribution of the map's points around each of k queries."""
 
     mean: Float32[Array, "k 3"]
-    """m, in the anchored frame."""
+    """Mean of the points, m, in the anchored frame."""
     normal: Float32[Array, "k 3"]
-    """Direction of the smallest variance, of unit length."""
+    """Direction of the smallest variance, of unit length, in world axes."""
     variances: Float32[Array, "k 2"]
     """The two smaller variances, ascending, m^2."""
     count: Float32[Array, " k"]
-    """Points of the distribution."""
+    """Number of points of the distribution."""
     valid: Bool[Array, " k"]
     """False where no voxel around the query holds enough points."""
 
 
 def empty_map(capacity: int) -> VoxelMap:
-    """Return a map of ``capacity`` free slots (a power of two)."""
+    """Return a map of free slots.
+
+    Args:
+        capacity: number of slots, a power of two.
+    """
     return VoxelMap(
         voxel=jnp.full((capacity, 3), FREE, jnp.int32),
         moments=jnp.zeros((capacity, 10), jnp.float32),
@@ -79,7 +85,15 @@ def empty_map(capacity: int) -> VoxelMap:
 
 
 def anchor_of(position: Float[Array, "3"], voxel_size: Float[Array, ""]) -> tuple[Int32[Array, "3"], Array]:
-    """Return the voxel that holds ``position`` and its lower corner (m, in world, position's dtype)."""
+    """Return the voxel that contains a position, and the voxel's lower corner.
+
+    Args:
+        position: m, in world.
+        voxel_size: edge length, m.
+
+    Returns:
+        The voxel's integer coordinates, and its lower corner in world, m, in the dtype of ``position``.
+    """
     anchor = jnp.floor(position / voxel_size).astype(jnp.int32)
     return anchor, anchor.astype(position.dtype) * voxel_size
 
@@ -93,14 +107,14 @@ def query_nearest(
 ) -> Planes:
     """Return, for each point, the distribution with the nearest mean among four voxels.
 
-    The four are the point's own voxel and the face neighbour on the nearer side along each axis.
+    The four voxels are the point's own voxel and, along each axis, the face neighbour on the nearer side.
 
     Args:
         vmap: the map.
         points: m, in the frame anchored at ``anchor``.
         anchor: voxel whose lower corner is the origin of ``points``.
         voxel_size: edge length, m.
-        min_points: points a voxel needs to count.
+        min_points: least number of points of a voxel that is used.
     """
     points = points.astype(jnp.float32)
     scaled = points / voxel_size
@@ -138,12 +152,12 @@ def insert(
 ) -> tuple[VoxelMap, Insertion]:
     """Add points to the distributions of their voxels.
 
-    A point is taken if its cell is still empty, which keeps a distribution even where the sensor's lines are
-    not. A new voxel claims a slot that is free or holds a voxel farther than ``reach`` from the anchor: that
-    is how the map forgets.
+    A point is added only if its cell is empty, so a distribution is uniform although the sensor's lines are
+    not. A new voxel claims a slot that is free, or that holds a voxel farther than ``reach`` from the anchor.
+    So the map forgets voxels that are far away.
 
     Args:
-        vmap: donate it where it is not needed afterwards.
+        vmap: the map; donate it if it is not needed afterwards.
         points: m, in the frame anchored at ``anchor``.
         mask: which rows are real.
         anchor: voxel whose lower corner is the origin of ``points``.
@@ -178,7 +192,12 @@ def insert(
 
 
 def find_slots(vmap: VoxelMap, voxel: Int32[Array, "*b 3"]) -> Int32[Array, "*b"]:
-    """Return the slot of each voxel, -1 where the map does not hold it."""
+    """Return the slot of each voxel; -1 where the map does not hold it.
+
+    Args:
+        vmap: the map.
+        voxel: integer coordinates.
+    """
     first = _first_slot(vmap, voxel)
     slot = jnp.full(voxel.shape[:-1], -1, jnp.int32)
     for way in range(WAYS):
@@ -189,7 +208,7 @@ def find_slots(vmap: VoxelMap, voxel: Int32[Array, "*b 3"]) -> Int32[Array, "*b"
 
 
 class _Grid(eqx.Module):
-    """Where points lie in the table's grid."""
+    """The grid of the table, seen from an anchor."""
 
     anchor: Int32[Array, "3"]
     voxel_size: Float32[Array, ""]
@@ -198,7 +217,7 @@ class _Grid(eqx.Module):
     def places(
         self, points: Float32[Array, "m 3"]
     ) -> tuple[Int32[Array, "m 3"], Int32[Array, "m 3"], Float32[Array, "m 3"]]:
-        """Return each point's voxel, its cell therein, and its offset from the voxel's centre, m."""
+        """Return each point's voxel, its cell in that voxel, and its offset from the voxel's centre, m."""
         scaled = points / self.voxel_size
         local = jnp.floor(scaled)
         fraction = scaled - local
@@ -209,7 +228,7 @@ class _Grid(eqx.Module):
 def _insert_new(
     vmap: VoxelMap, points: Float32[Array, "m 3"], mask: Bool[Array, " m"], grid: _Grid
 ) -> tuple[VoxelMap, Bool[Array, " m"], Bool[Array, " m"]]:
-    """Insert one batch: the map, which points filled a cell, which found no slot."""
+    """Insert one batch; return the map, which points filled a cell, and which found no slot."""
     capacity = vmap.voxel.shape[0]
     voxel, cell, offset = grid.places(points)
     slot, fresh, homeless = _claim_slots(vmap, voxel, mask, grid.anchor, grid.reach / grid.voxel_size)
@@ -244,7 +263,7 @@ def _insert_new(
 
 
 def _held(vmap: VoxelMap, slot: Int32[Array, " m"], cell: Int32[Array, "m 3"]) -> Bool[Array, " m"]:
-    """Return which points' cells hold a point already, given a slot or -1."""
+    """Return which points' cells hold a point already; ``slot`` is -1 where the map has no such voxel."""
     word, bit = _word_and_bit(cell)
     return (_take(vmap.cells, (jnp.maximum(slot, 0), word)) & bit) != 0
 
@@ -257,7 +276,7 @@ def _word_and_bit(cell: Int32[Array, "m 3"]) -> tuple[Int32[Array, " m"], UInt32
 def _claim_slots(
     vmap: VoxelMap, voxel: Int32[Array, "m 3"], mask: Array, anchor: Array, reach: Array
 ) -> tuple[Int32[Array, " m"], Bool[Array, " m"], Bool[Array, " m"]]:
-    """Find or claim a slot for each voxel: (slot or -1, newly claimed, left without)."""
+    """Return the slot of each voxel or -1, whether it was claimed now, and whether none was found."""
     capacity = vmap.voxel.shape[0]
     order = jnp.arange(voxel.shape[0], dtype=jnp.int32)
     first = _first_slot(vmap, voxel)
@@ -267,7 +286,7 @@ def _claim_slots(
     claims = jnp.full(capacity, -1, jnp.int32)
     for way in range(WAYS):
         candidate = first + way
-        # in floats, because a free slot's coordinates would overflow; they count as far away
+        # as floats, because the integer coordinates of a free slot would overflow; they count as far away
         apart = _take(vmap.voxel, candidate).astype(jnp.float32) - anchor.astype(jnp.float32)
         open_slot = jnp.linalg.norm(apart, axis=-1) > reach
         asks = homeless & open_slot & (_take(claims, candidate) < 0)
@@ -277,13 +296,13 @@ def _claim_slots(
         slot = jnp.where(housed, candidate, slot)
         fresh |= housed
         homeless &= ~housed
-    # a voxel whose own slot was just claimed by another (it lay beyond reach) must not write into it
+    # another voxel may have claimed the slot of a voxel beyond reach: the latter must not write into it
     evicted = (slot >= 0) & ~fresh & (_take(claims, jnp.maximum(slot, 0)) >= 0)
     return jnp.where(evicted, -1, slot), fresh, homeless | evicted
 
 
 def _one_per_cell(wants: Bool[Array, " m"], cell: Int32[Array, "m 3"]) -> Bool[Array, " m"]:
-    """Keep one candidate per cell; cells that share a hash wait for the next scan."""
+    """Return one candidate per cell; of cells that share a hash only one gets a point."""
     table = 1 << (4 * wants.shape[0] - 1).bit_length()
     order = jnp.arange(wants.shape[0], dtype=jnp.int32)
     ticket = jnp.where(wants, (voxel_hash(cell) & jnp.uint32(table - 1)).astype(jnp.int32), table)
@@ -294,7 +313,7 @@ def _one_per_cell(wants: Bool[Array, " m"], cell: Int32[Array, "m 3"]) -> Bool[A
 def _mean(
     vmap: VoxelMap, slot: Int32[Array, "*b"], local: Int32[Array, "*b 3"], voxel_size: Float32[Array, ""]
 ) -> Float32[Array, "*b 3"]:
-    """Return the means of slots that hold the voxels ``local`` of the anchored frame, m."""
+    """Return the means, m, in the anchored frame, of slots that hold the voxels ``local`` of that frame."""
     return (local.astype(jnp.float32) + 0.5) * voxel_size + _take(vmap.centroid, slot)[..., :3]
 
 

@@ -1,4 +1,11 @@
-"""Sparse Cholesky factorisation of block matrices: chains are reduced first, the rest is multifrontal."""
+"""Sparse Cholesky factorisation of symmetric block matrices: chains first, then the multifrontal method.
+
+The graph of a matrix has a node for each block on the diagonal and an edge for each block below it. Pose
+graphs have long chains of nodes with two neighbours. :func:`chains_of` finds them, :func:`chain_reduction`
+eliminates every second node of all chains at once, level by level (cyclic reduction), and
+:mod:`~lio_jax.pose_graph.multifrontal` eliminates the nodes that are left. The order and the plan depend on
+the graph only; :func:`factorise` and :func:`solve` work on the numbers.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -17,27 +24,27 @@ _Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Chains:
-    """Chains one behind the other, each between the two nodes that it hangs on."""
+    """Chains in one array, one after the other, each between the two nodes at its ends."""
 
     nodes: _Numbers
-    """(s,); the number of all nodes where a chain hangs on nothing."""
+    """(s,) number of each node; the count of all nodes where a chain has no neighbour at its end."""
     place: _Numbers
-    """(s,) within the chain, from 0."""
+    """(s,) place of each node within its chain, from 0."""
     outside: _Flags
-    """(s,) True of what a chain hangs on: it is no part of it."""
+    """(s,) True for the neighbours at the ends of a chain, which are not part of it."""
     link: _Numbers
-    """(s,) the pair of a node and the one behind it; -1 where there is none."""
+    """(s,) number of the pair of a node and the next one; -1 where there is none."""
 
 
 def chains_of(count: int, pairs: _Numbers) -> Chains:
     """Return the chains of a graph.
 
-    A node of each part of the graph is in none of them, so that a ring has ends too, nor is one of each chain
-    that would hang on one node with both ends.
+    One node of each connected part is in no chain, so that a ring has ends as well. One node is also left out
+    of each chain whose two ends have the same neighbour.
 
     Args:
-        count: of nodes.
-        pairs: (m, 2) nodes that are coupled, none twice.
+        count: number of nodes.
+        pairs: (m, 2) coupled nodes; no pair occurs twice.
     """
     inside = np.bincount(pairs.ravel(), minlength=count) <= 2
     inside[_first_of_each_part(count, pairs)] = False
@@ -89,7 +96,7 @@ def _chains_among(inside: _Flags, pairs: _Numbers) -> Chains:
 def _end_to_end(inside: _Flags, inner: _Numbers) -> tuple[_Numbers, _Flags]:
     """Return the nodes of all chains in their order, and which of them begin a chain.
 
-    Depth first from a node that is coupled to all ends, one chain is walked through after the other.
+    A depth-first search from an extra node, which is coupled to all ends, visits one chain after the other.
     """
     root = len(inside)
     ends = np.flatnonzero(inside & (np.bincount(inner.ravel(), minlength=root) < 2))
@@ -100,52 +107,56 @@ def _end_to_end(inside: _Flags, inner: _Numbers) -> tuple[_Numbers, _Flags]:
 
 
 WORTH_A_LEVEL = 48
-"""Fewer nodes are eliminated as fast with the rest of the graph."""
+"""Least number of nodes in a level. Fewer nodes are eliminated as fast with the rest of the graph."""
 _AT_ONCE = 1024
-"""More nodes make two levels of one: fresh memory for all of them costs more than their arithmetic."""
+"""Largest number of nodes in a level. For more nodes, new memory costs more time than the arithmetic."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """Nodes that are eliminated at once: none is coupled to another one.
+    """Nodes that are eliminated at once, because none is coupled to another one.
 
-    Blocks count from those on the diagonal on, then come those of the pairs, whose rows are the greater
-    node's. The first coupling's place then takes the block that couples the neighbours.
+    Blocks are numbered from those on the diagonal on; then follow those of the pairs, whose rows belong to
+    the greater node. After the elimination the place of a node's first coupling holds the block that couples
+    its two neighbours.
     """
 
     nodes: _Numbers
-    """(k,)."""
+    """(k,) nodes to eliminate."""
     neighbours: _Numbers
-    """(k, 2) the smaller first; the number of all nodes where there is none."""
+    """(k, 2) neighbours of each node, the smaller first; the count of all nodes where there is none."""
     couplings: _Numbers
-    """(k, 2) blocks of a node with its neighbours; -1, the last one, of zeros, where there is none."""
+    """(k, 2) numbers of the blocks of a node with its neighbours; -1, the last block, which is zero, where
+    there is none."""
     touched: _Numbers
-    """(t,) the neighbours, each once."""
+    """(t,) all neighbours, each once."""
     sums: sparse.csr_array
-    """(t, 2 k) adds up what each of ``touched`` gets from the levels' nodes, whose first neighbours count
-    before their second ones."""
+    """(t, 2 k) matrix that sums what each node of ``touched`` receives from the level's nodes: from those
+    whose first neighbour it is, then from those whose second neighbour it is."""
 
 
 @dataclass(frozen=True)
 class Reduction:
-    """What is eliminated of a graph's chains, and the graph that is left."""
+    """The elimination of a graph's chains, and the graph that is left."""
 
     levels: tuple[Level, ...]
+    """Levels in the order of elimination."""
     kept: _Numbers
     """(c,) nodes that are left, ascending."""
     pairs: _Numbers
-    """(p, 2) of places in ``kept``, the greater first, none twice."""
+    """(p, 2) coupled nodes of the graph that is left, as places in ``kept``, the greater first."""
     sums: sparse.csr_array
-    """(c + p, n + m + 1) makes the blocks of the graph that is left from all, the last one of zeros."""
+    """(c + p, n + m + 1) matrix that maps all blocks, the last of which is zero, to those of the graph that
+    is left."""
 
 
 def chain_reduction(count: int, pairs: _Numbers, worth_a_level: int = WORTH_A_LEVEL) -> Reduction:
-    """Return which nodes are eliminated in levels.
+    """Return the levels in which the nodes of chains are eliminated, and the graph that is left.
 
     Args:
-        count: of nodes.
-        pairs: (m, 2) nodes that are coupled, the greater first, none twice.
-        worth_a_level: fewer nodes make no level.
+        count: number of nodes.
+        pairs: (m, 2) coupled nodes, the greater first; no pair occurs twice.
+        worth_a_level: least number of nodes in a level.
     """
     levels: list[Level] = []
     chains = chains_of(count, pairs)
@@ -203,23 +214,26 @@ _Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Order:
-    """The order of elimination, for blocks of any size."""
+    """The order of elimination of a graph, for blocks of any size."""
 
     reduction: Reduction
+    """Elimination of the chains."""
     tree: EliminationTree
-    """Of what the reduction leaves."""
+    """Elimination of the graph that the reduction leaves."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """All that does not depend on the numbers of a matrix of d by d blocks."""
+    """The plan of a factorisation, for all matrices of d by d blocks with one pattern."""
 
     order: Order
+    """Order of elimination."""
     fronts: multifrontal.Plan
+    """Plan for the graph that the reduction leaves."""
 
     @property
     def size(self) -> int:
-        """d."""
+        """Return d, the number of rows of a block."""
         return self.fronts.size
 
 
@@ -228,54 +242,62 @@ class Factor:
     """The Cholesky factor of a matrix."""
 
     plan: Plan
+    """Plan of the matrix's pattern."""
     levels: tuple["_Columns", ...]
+    """Columns of the nodes of each level."""
     fronts: multifrontal.Factor
+    """Factor of the matrix that the reduction leaves."""
 
 
 @dataclass(frozen=True)
 class _Columns:
-    """Of the k nodes of a level."""
+    """Columns of the Cholesky factor for the k nodes of a level."""
 
     root: _Array
-    """(k, d, d) L^-T of their own blocks' factors L."""
+    """(k, d, d) L^-T of the factors L of the nodes' own blocks."""
     beside: _Array
-    """(k, 2 d, d) rows of their neighbours."""
+    """(k, 2 d, d) rows of the nodes' two neighbours."""
 
 
 def order_of(count: int, pairs: NDArray[np.int64], worth_a_level: int = WORTH_A_LEVEL) -> Order:
-    """Return an order of little fill.
+    """Return an order of elimination with little fill-in.
 
     Args:
-        count: of nodes.
-        pairs: (m, 2) nodes that are coupled, the greater first, none twice.
-        worth_a_level: so many nodes of chains are eliminated at once, or none.
+        count: number of nodes.
+        pairs: (m, 2) coupled nodes, the greater first; no pair occurs twice.
+        worth_a_level: least number of nodes of chains that are eliminated at once.
     """
     reduction = chain_reduction(count, pairs, worth_a_level)
     return Order(reduction, elimination_tree(len(reduction.kept), reduction.pairs))
 
 
 def plan_of(order: Order, size: int) -> Plan:
-    """Return the plan of matrices of size by size blocks."""
+    """Return the plan of a factorisation.
+
+    Args:
+        order: order of elimination.
+        size: number of rows of a block.
+    """
     reduction = order.reduction
     return Plan(order, multifrontal.plan_of(reduction.pairs, size, order.tree))
 
 
 def factorise(plan: Plan, diagonal: _Array, pairs: _Array) -> Factor:
-    """Return the factor of a symmetric matrix.
+    """Return the Cholesky factor of a symmetric matrix.
 
     Args:
-        plan: of its pattern.
-        diagonal: (n, d, d) blocks.
-        pairs: (m, d, d) blocks, whose rows are the greater node's.
+        plan: plan of the matrix's pattern.
+        diagonal: (n, d, d) blocks on the diagonal.
+        pairs: (m, d, d) blocks of the pairs; their rows belong to the greater node.
 
     Raises:
-        NotPositiveDefiniteError: it is not positive definite.
+        NotPositiveDefiniteError: the matrix is not positive definite.
     """
     reduction = plan.order.reduction
     if not reduction.levels:
         return Factor(plan, (), multifrontal.factorise(plan.fronts, np.concatenate([diagonal, pairs])))
     size = plan.size
-    # the last one stays zero: of neighbours that aren't there
+    # the last block stays zero: it stands for neighbours that do not exist
     blocks = np.concatenate([diagonal, pairs, np.zeros((1, size, size))])
     columns = tuple(_eliminated(level, blocks) for level in reduction.levels)
     left = (reduction.sums @ blocks.reshape(len(blocks), -1)).reshape(-1, size, size)
@@ -283,7 +305,7 @@ def factorise(plan: Plan, diagonal: _Array, pairs: _Array) -> Factor:
 
 
 def _eliminated(level: Level, blocks: _Array) -> _Columns:
-    """Return the columns of a level's nodes, and take what they explain from their neighbours' blocks."""
+    """Return the columns of a level's nodes, and reduce their neighbours' blocks to the Schur complement."""
     count, size = len(level.nodes), blocks.shape[-1]
     couplings = blocks[level.couplings]
     turned = level.neighbours < level.nodes[:, None]
@@ -295,13 +317,13 @@ def _eliminated(level: Level, blocks: _Array) -> _Columns:
     for k in range(size):
         if not np.all(panel[k, k] > 0):
             raise NotPositiveDefiniteError
-        # of the identity's rows those that are still zero here stay so
+        # the rows of the identity below this one are still zero, and stay zero
         stop = 3 * size + k + 1
         panel[k:stop, k] *= 1 / np.sqrt(panel[k, k])
         panel[k + 1 : stop, k + 1 :] -= panel[k + 1 : stop, k, None] * panel[k + 1 : size, k]
     beside = np.ascontiguousarray(panel[size : 3 * size].transpose(2, 0, 1))
     root = np.ascontiguousarray(panel[3 * size :].transpose(2, 0, 1))
-    # a product with a copy of the transpose takes half the time of one with its view
+    # a product with a copy of the transpose takes half the time of a product with its view
     explained = beside @ np.ascontiguousarray(beside.transpose(0, 2, 1))
     blocks[level.couplings[:, 0]] = -explained[:, size:, :size]
     own = np.concatenate([explained[:, :size, :size], explained[:, size:, size:]])
@@ -310,7 +332,15 @@ def _eliminated(level: Level, blocks: _Array) -> _Columns:
 
 
 def solve(factor: Factor, right: _Array) -> _Array:
-    """Return the solution of A x = right for (n, d) or (n, d, k) right-hand sides."""
+    """Return the solution x of A x = right.
+
+    Args:
+        factor: Cholesky factor of A.
+        right: (n, d) right-hand side, or (n, d, k) for k of them.
+
+    Returns:
+        x, of the shape of ``right``.
+    """
     reduction = factor.plan.order.reduction
     if not reduction.levels:
         return multifrontal.solve(factor.fronts, right)

@@ -1,8 +1,10 @@
-"""Poses from edges alone: rotations as if they were any matrices, then translations (chordal initialisation).
+"""A first guess of a pose graph's poses from its edges alone (chordal initialisation).
 
-Carlone, Tron, Daniilidis & Dellaert, "Initialization techniques for 3D SLAM: a survey on rotation estimation
-and its use in pose graph optimization", ICRA 2015, section III-D. Both steps are linear least squares that
-share the order of elimination with the solve itself.
+The first step finds the rotations, with the constraint that they are rotations left out; the second step
+finds the translations. Both are linear least squares with the order of elimination of the solve itself.
+
+Source: Carlone, Tron, Daniilidis & Dellaert, "Initialization techniques for 3D SLAM: a survey on rotation
+estimation and its use in pose graph optimization", ICRA 2015, section III-D.
 """
 
 import jax
@@ -28,15 +30,15 @@ _Array = NDArray[np.float64]
 
 
 def chordal_poses(graph: PoseGraph, structure: Structure, weights: _Array | None = None) -> Poses:
-    """Return poses that are near the least cost, whatever the poses of the graph's free vertices are.
+    """Return poses near the least cost. They do not depend on the graph's own poses of free vertices.
 
     Args:
-        graph: whose edges, fixed vertices and first vertices are taken.
-        structure: of the graph.
-        weights: (e,) of the edges' information.
+        graph: its edges, and the poses of its held vertices.
+        structure: structure of the graph.
+        weights: (e,) factors of the edges' information; None: 1.
 
     Raises:
-        NotPositiveDefiniteError: the edges leave a rotation or a translation open.
+        NotPositiveDefiniteError: the edges do not determine all rotations and translations.
     """
     weights = np.ones(len(structure.i)) if weights is None else weights
     positions = np.flatnonzero(structure.kind == POSITION)
@@ -60,14 +62,19 @@ def chordal_poses(graph: PoseGraph, structure: Structure, weights: _Array | None
 
 
 def _with_held(graph: PoseGraph, structure: Structure, R: _Array, t: _Array) -> Poses:
-    """Return poses of which those of held vertices are the graph's own, to the last digit."""
+    """Return the poses; those of held vertices are exactly the graph's own."""
     found = poses_from(R, t)
     numbers = np.where(structure.held[:, None], numbers_of(graph.poses), numbers_of(found))
     return type(found)(jax.device_put(numbers))
 
 
 def edges_at(graph: PoseGraph, index: NDArray[np.int64]) -> PoseGraph:
-    """Return the graph with only these edges."""
+    """Return the graph with some of its edges.
+
+    Args:
+        graph: vertices and edges.
+        index: (k,) numbers of the edges to keep.
+    """
 
     def chosen(leaf: ArrayLike) -> jax.Array:
         return jax.device_put(np.asarray(leaf)[index])
@@ -85,7 +92,7 @@ def edges_at(graph: PoseGraph, index: NDArray[np.int64]) -> PoseGraph:
 
 
 def _relative_poses(graph: PoseGraph, structure: Structure, weights: _Array) -> tuple[_Array, _Array]:
-    """Return rotations and translations that edges and priors ask for."""
+    """Return the rotations and the translations (m) that agree best with edges and priors."""
     Z, z = rotation_matrices(graph.measurement), translations(graph.measurement)
     dimensions = z.shape[-1]
     information = np.asarray(graph.information, np.float64) * weights[:, None, None]
@@ -94,7 +101,7 @@ def _relative_poses(graph: PoseGraph, structure: Structure, weights: _Array) -> 
     identity = np.eye(dimensions)
     held = structure.held[:, None, None]
 
-    # R_i Z = R_j for the transposes, which then count column by column
+    # R_i Z = R_j for the transposes, whose columns are then independent unknowns
     precision = np.trace(information[:, :turning, :turning], axis1=1, axis2=2) / turning
     Z_turned = Z.transpose(0, 2, 1)
     R_turned = _least_squares(
@@ -124,11 +131,11 @@ def _least_squares(
     """Return the x that minimise the sum of |M x_i + c - x_j|^2, weighted by ``precision``.
 
     Args:
-        structure: of the graph.
-        precision: (e, k, k).
-        factor: (e, k, k) M.
-        offset: (e, k, r) c.
-        start: (n, k, r) values of the held vertices; 0 for the others.
+        structure: structure of the graph.
+        precision: (e, k, k) weight of each edge.
+        factor: (e, k, k) M of each edge.
+        offset: (e, k, r) c of each edge.
+        start: (n, k, r) values x of the held vertices; 0 for the others.
     """
     i, j = structure.unknown[structure.i], structure.unknown[structure.j]
     count = structure.count
@@ -147,7 +154,7 @@ def _least_squares(
 
 
 def _summed(place: NDArray[np.int64], values: _Array, count: int) -> _Array:
-    """Return (count, ...) sums of the values by their place; what lies at place ``count`` is dropped."""
+    """Return the (count, ...) sums of the values at each place; values at place ``count`` are dropped."""
     gather = sparse.csr_matrix(
         (np.ones(len(place)), (place, np.arange(len(place)))), shape=(count + 1, len(place))
     )
@@ -156,7 +163,10 @@ def _summed(place: NDArray[np.int64], values: _Array, count: int) -> _Array:
 
 
 def _laid_onto(points: _Array, targets: _Array, weights: _Array) -> tuple[_Array, _Array]:
-    """Return the turn and shift that lay points (m, k) onto targets best; no turn where that is open."""
+    """Return the rotation and the translation that align (m, k) points with targets by least squares.
+
+    A rotation that the points do not determine is the identity.
+    """
     share = weights / max(weights.sum(), np.finfo(float).tiny)
     centre, target_centre = share @ points, share @ targets
     spread = (targets - target_centre).T @ ((points - centre) * share[:, None])

@@ -1,4 +1,8 @@
-"""Levenberg-Marquardt on the normal equations of a pose graph."""
+"""Levenberg-Marquardt on a pose graph.
+
+The device linearises all edges and assembles the normal equations. A graph is padded to a size that many
+graphs share, so that few programs are compiled. The host factorises the equations and chooses the damping.
+"""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -17,35 +21,42 @@ from lio_jax.pose_graph.structure import Structure
 
 
 class Places(NamedTuple):
-    """Where vertices and edges add to the normal equations; the last place takes what is not wanted."""
+    """The places in the normal equations where vertices and edges add; the last place (-1) is not used."""
 
     unknown: Int[Array, " n"]
+    """Place of each vertex on the diagonal and in the gradient."""
     pair: Int[Array, " e"]
+    """Place of each edge among the pairs."""
     turned: Bool[Array, " e"]
-    """True where the edge's block is the transpose of the pair's."""
+    """True where the edge's block is the transpose of the pair's block."""
 
 
 class Padded(NamedTuple):
-    """A graph of a size that many graphs share, so that they share their compiled programs too."""
+    """A graph, padded to a size that many graphs share, so that they share their compiled programs."""
 
     graph: PoseGraph
+    """The graph with padded vertices and edges."""
     places: Places
+    """Places of its vertices and edges in the normal equations."""
 
 
 class Point(NamedTuple):
-    """Poses and the normal equations around them, H dx = -g."""
+    """Poses and the normal equations H dx = -g at these poses."""
 
     poses: Poses
+    """(n,) T_world_vertex, m."""
     cost: Float[Array, ""]
+    """Weighted sum of ``edge_costs``."""
     edge_costs: Float[Array, " e"]
-    """r' Omega r / 2 of each edge, not weighted."""
+    """r' Omega r / 2 of each edge, without its weight."""
     blocks: Float[Array, "b d d"]
-    """Blocks of H: on the diagonal, then of the pairs (the last of each is nobody's)."""
+    """Blocks of H: those on the diagonal, then those of the pairs; the last block of each is not used."""
     gradient: Float[Array, "u d"]
+    """Gradient g; the last row is not used."""
 
 
 def size_at_least(count: int) -> int:
-    """Return the next size of the form 4, 5, 6 or 7 times a power of two, 32 at least."""
+    """Return the least size not below ``count`` and 32 that is 4, 5, 6 or 7 times a power of two."""
     power = 8
     while 7 * power < count:
         power *= 2
@@ -53,7 +64,12 @@ def size_at_least(count: int) -> int:
 
 
 def padded(graph: PoseGraph, structure: Structure) -> Padded:
-    """Return the graph at its padded size; edges that were added have no information."""
+    """Return the graph at its padded size; added edges have no information, and added vertices are fixed.
+
+    Args:
+        graph: vertices and edges.
+        structure: structure of the graph.
+    """
     edges, vertices = len(structure.i), len(structure.held)
     more_edges, more_vertices = size_at_least(edges) - edges, size_at_least(vertices) - vertices
 
@@ -77,10 +93,10 @@ def padded(graph: PoseGraph, structure: Structure) -> Padded:
 
 
 def places_in(structure: Structure) -> Places:
-    """Return where vertices and edges add, at the padded size."""
+    """Return the places in the normal equations where the vertices and edges of a padded graph add."""
 
     def longer(values: NDArray, none: int) -> Array:
-        """Return padded values, with those that equal ``none`` at the last place."""
+        """Return padded values, with -1, the last place, for those that equal ``none``."""
         wanted = np.where(values == none, -1, values)
         return jax.device_put(np.pad(wanted, (0, more(len(values))), constant_values=-1))
 
@@ -96,7 +112,7 @@ def places_in(structure: Structure) -> Places:
 
 
 def padded_poses(poses: Poses, count: int) -> Poses:
-    """Return ``count`` poses, the identity behind those given."""
+    """Return ``count`` poses: those given, then identities."""
     own = numbers_of(poses)
     none = np.zeros((count - len(own), own.shape[-1]), own.dtype)
     none[:, 0] = 1
@@ -104,7 +120,7 @@ def padded_poses(poses: Poses, count: int) -> Poses:
 
 
 def padded_weights(weights: NDArray[np.float64], padded: Padded) -> Float[Array, " e"]:
-    """Return weights of the edges, 0 of those that padding added."""
+    """Return the weights of a padded graph's edges: those given, then 0 for added edges."""
     return jax.device_put(np.pad(weights, (0, len(padded.graph.i) - len(weights))))
 
 
@@ -112,12 +128,12 @@ def padded_weights(weights: NDArray[np.float64], padded: Padded) -> Float[Array,
 def point_after(
     poses: Poses, step: Float[Array, "u d"], weights: Float[Array, " e"], padded: Padded
 ) -> Point:
-    """Return what lies a step away from the poses.
+    """Return the poses after a step, and the normal equations there.
 
     Args:
-        poses: (n,).
-        step: of the unknowns; the last one stays zero.
-        weights: of the edges' information.
+        poses: (n,) T_world_vertex, m.
+        step: right perturbation of each unknown, rotation (rad) before translation (m); the last row is zero.
+        weights: factor of each edge's information.
         padded: the graph.
     """
     graph, places = padded
@@ -144,31 +160,35 @@ def point_after(
 
 
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-10, 1e8
-"""Relative to the diagonal of the normal equations."""
+"""Bounds of the damping, relative to the diagonal of the normal equations."""
 _FAITHFUL = 0.5
-"""A step that gains this share of what it promised may be followed by a less damped one."""
+"""Least ratio of the actual to the predicted decrease of the cost after which the damping is reduced."""
 _ROUNDING = 1e-12
-"""Relative; smaller changes of the cost may be those of its sum."""
+"""Relative change of the cost below which it may be a rounding error of the sum."""
 _NEGLIGIBLE_PER_EDGE = 1e-14
-"""A decrease of the cost that is only rounding, where all edges agree."""
+"""Decrease of the cost per edge that is only rounding where all edges agree."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """When a descent ends."""
+    """Conditions that end a descent."""
 
     iterations: int = 100
-    """Linear systems at most."""
+    """Largest number of linear systems solved."""
     tolerance: float = 1e-8
-    """Converged when a step promises to lower the cost by less than this share; that step is still made."""
+    """Relative decrease of the cost below which the descent has converged; the step that predicts it is still
+    made."""
 
 
 class Descent(NamedTuple):
-    """Where a descent ended."""
+    """The result of a descent."""
 
     point: Point
+    """The best poses, with the normal equations there."""
     iterations: int
+    """Number of linear systems solved."""
     status: Status
+    """Why the descent ended."""
 
 
 def descend(
@@ -176,16 +196,17 @@ def descend(
 ) -> Descent:
     """Return the poses of least cost near the given ones.
 
-    Plain Gauss-Newton steps while they lower the cost; else the diagonal is raised by a share of itself, the
-    more the more steps fail in a row, and by a tenth of it after each one that keeps its promise (Marquardt,
-    "An algorithm for least-squares estimation of nonlinear parameters", 1963).
+    The steps are those of Gauss-Newton while they lower the cost. After a step that fails, the diagonal is
+    increased by a share of itself, which grows with each failure in a row. After a step whose decrease is
+    near the predicted one, the share is divided by ten (Marquardt, "An algorithm for least-squares estimation
+    of nonlinear parameters", 1963).
 
     Args:
         padded: the graph.
-        structure: of the graph.
-        poses: (n,) to start from, of the padded size.
-        weights: of the edges, of the padded size.
-        limits: when to end.
+        structure: structure of the graph without padding.
+        poses: (n,) poses to start from, at the padded size.
+        weights: factors of the edges' information, at the padded size.
+        limits: conditions that end the descent.
     """
     step = np.zeros((len(padded.places.unknown) + 1, structure.tangent_size), padded.graph.information.dtype)
     point = point_after(poses, jax.device_put(step), weights, padded)
@@ -225,16 +246,17 @@ class Equations:
     """The normal equations H dx = -g on the host, without padding."""
 
     structure: Structure
+    """Structure of the graph, with the plan of the factorisation."""
     diagonal: NDArray[np.float64]
-    """(n, d, d)."""
+    """(n, d, d) blocks of H on the diagonal, for n unknown vertices."""
     pairs: NDArray[np.float64]
-    """(m, d, d)."""
+    """(m, d, d) blocks of H for the m pairs of coupled unknowns."""
     gradient: NDArray[np.float64]
-    """(n, d)."""
+    """(n, d) gradient g."""
 
     @staticmethod
     def at(point: Point, structure: Structure) -> "Equations":
-        """Take over what was assembled on the device."""
+        """Return the equations that were assembled on the device."""
         blocks, gradient = jax.device_get((point.blocks, point.gradient))
         first = len(gradient)
         return Equations(
@@ -245,10 +267,13 @@ class Equations:
         )
 
     def solved(self, damping: float) -> tuple[NDArray[np.float64], float]:
-        """Return the step and by how much it lowers the cost of the linearised graph.
+        """Return the (n, d) step, and the decrease of the cost that the linearised graph predicts for it.
+
+        Args:
+            damping: increase of H's diagonal, as a share of it.
 
         Raises:
-            NotPositiveDefiniteError: H is singular, as far as numbers tell.
+            NotPositiveDefiniteError: H is numerically singular.
         """
         scale = np.diagonal(self.diagonal, axis1=1, axis2=2)
         added = damping * np.maximum(scale, 1e-6 * scale.max(initial=0.0))

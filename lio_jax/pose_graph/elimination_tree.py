@@ -1,6 +1,6 @@
 """The order in which a graph's nodes are eliminated, and which of them are eliminated together.
 
-Found once per graph: the structure never changes between iterations, only the numbers do.
+It is found once for each graph: only the numbers change between iterations, not the structure.
 """
 
 from dataclasses import dataclass
@@ -11,47 +11,50 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 _TOGETHER = 16
-"""So few nodes are always eliminated with their parent: a product of matrices beats its own overhead."""
+"""Number of nodes up to which a child and its parent are always joined, to save the overhead of a front."""
 _ZEROS = 0.2
-"""Nodes join their parent while at most this share of what they fill is zero."""
+"""Largest share of zeros in a larger front that is joined of a child and its parent."""
 
 
 @dataclass(frozen=True)
 class Front:
     """Nodes that are eliminated together, in one dense matrix.
 
-    Nodes are named by their position in the order of elimination.
+    Nodes are numbered by their position in the order of elimination.
     """
 
     start: int
+    """First node that is eliminated here."""
     stop: int
-    """The nodes from start to before stop are eliminated here."""
+    """First node after those that are eliminated here."""
     rows: NDArray[np.int64]
-    """Nodes of later fronts that these are coupled to, ascending."""
+    """Nodes of later fronts that are coupled to the front's own nodes, ascending."""
     parent: int
-    """The front that takes up what is left of this one; -1: none."""
+    """Number of the front to which this one's Schur complement is added; -1: none."""
 
 
 @dataclass(frozen=True)
 class EliminationTree:
-    """Fronts in the order of elimination."""
+    """The order of elimination of n nodes, and their fronts."""
 
     position: NDArray[np.int64]
-    """(n,) of each node in the order of elimination."""
+    """(n,) position of each node in the order of elimination."""
     fronts: tuple[Front, ...]
+    """Fronts in the order of elimination; children are before their parents."""
 
 
 def elimination_tree(count: int, pairs: NDArray[np.int64]) -> EliminationTree:
-    """Return an order of little fill and its fronts.
+    """Return an order of elimination with little fill-in, and its fronts.
 
     The order is SuperLU's minimum degree (Liu, "Modification of the minimum-degree algorithm by multiple
-    elimination", 1985), and its factor of the graph's Laplacian has the pattern of ours. Nodes whose columns
-    look alike are joined into supernodes, small ones into their parents too (Ashcraft & Grimes, "The
-    influence of relaxed supernode partitions on the multifrontal method", 1989).
+    elimination", 1985). SuperLU's factor of the graph's Laplacian has the pattern of the Cholesky factor.
+    Nodes whose columns have the same pattern are joined into supernodes, and small supernodes are joined with
+    their parents (Ashcraft & Grimes, "The influence of relaxed supernode partitions on the multifrontal
+    method", 1989).
 
     Args:
-        count: of nodes.
-        pairs: (m, 2) nodes that are coupled.
+        count: number of nodes.
+        pairs: (m, 2) coupled nodes.
     """
     if count == 0:
         return EliminationTree(np.zeros(0, np.int64), ())
@@ -100,7 +103,7 @@ def elimination_tree(count: int, pairs: NDArray[np.int64]) -> EliminationTree:
 
 
 def _laplacian(count: int, pairs: NDArray[np.int64]) -> sparse.csc_matrix:
-    """Return the graph's Laplacian plus the identity: its factor exists, and nothing in it cancels."""
+    """Return the graph's Laplacian plus the identity: its factor exists, and no entry cancels to zero."""
     ones = np.ones(len(pairs))
     coupled = sparse.coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), (count, count)).tocsr()
     coupled = coupled + coupled.T
@@ -109,7 +112,7 @@ def _laplacian(count: int, pairs: NDArray[np.int64]) -> sparse.csc_matrix:
 
 
 def _supernodes(parent: NDArray[np.int64], below: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the first column of each run of columns with one pattern below them."""
+    """Return the first column of each run of columns that have the same pattern below them."""
     children = np.bincount(parent[parent >= 0], minlength=len(parent))
     goes_on = (parent[:-1] == np.arange(1, len(parent))) & (below[:-1] == below[1:] + 1) & (children[1:] == 1)
     return np.flatnonzero(np.append(True, ~goes_on))
@@ -118,7 +121,7 @@ def _supernodes(parent: NDArray[np.int64], below: NDArray[np.int64]) -> NDArray[
 def _amalgamated(
     width: NDArray[np.int64], below: NDArray[np.int64], parent: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return for each supernode the one in whose front it is eliminated: itself or one further up."""
+    """Return for each supernode the one in whose front it is eliminated: itself or an ancestor."""
     widths, rows, above = width.tolist(), below.tolist(), parent.tolist()
     zeros = [0] * len(widths)
     joined = list(range(len(widths)))
@@ -135,7 +138,7 @@ def _amalgamated(
 
 
 def _postorder(kept_in: NDArray[np.int64], parent: NDArray[np.int64]) -> tuple[list[int], list[int]]:
-    """Return the supernodes, those of one front side by side and children first, and the fronts' topmost."""
+    """Return the supernodes, front by front and children first, and the topmost one of each front."""
     members: list[list[int]] = [[] for _ in kept_in]
     children: list[list[int]] = [[] for _ in kept_in]
     for supernode, top in enumerate(kept_in.tolist()):

@@ -1,8 +1,8 @@
 """Residuals of a pose graph's edges, their cost and its linearisation.
 
-The cost is half the sum of r' Omega r, with r = Log(Z^-1 T_i^-1 T_j) by the group's logarithm: the error of
-gtsam's BetweenFactor and PriorFactor, in space and in the plane. g2o's own program counts twice that, of
-residuals that are no logarithms.
+The cost is half the sum of r' Omega r, with r = Log(Z^-1 T_i^-1 T_j) by the group's logarithm. This is the
+error of gtsam's BetweenFactor and PriorFactor, in space and in the plane. The program g2o uses the sum
+without the factor 1/2, and residuals that are not logarithms.
 """
 
 from typing import NamedTuple
@@ -16,28 +16,36 @@ from lio_jax.core.xla import computed_once
 from lio_jax.pose_graph.graph import POSITION, PRIOR, PoseGraph, Poses, between, picked, rotation_first
 
 _SERIES_BELOW = 0.3
-"""rad; below it the closed forms of the coefficients cancel."""
+"""Angle, rad, below which the closed forms of the coefficients cancel, so that their series are used."""
 
 
 class Linearised(NamedTuple):
-    """What each edge adds to the normal equations H dx = -g of a step of right perturbations."""
+    """The part of each edge in the normal equations H dx = -g of a step of right perturbations."""
 
     cost: Float[Array, " e"]
-    """r' Omega r / 2."""
+    """r' Omega r / 2 of each edge."""
     H_ii: Float[Array, "e d d"]
+    """Block of H for the edge's first vertex."""
     H_ij: Float[Array, "e d d"]
+    """Block of H with the rows of the first vertex and the columns of the second."""
     H_jj: Float[Array, "e d d"]
+    """Block of H for the edge's second vertex."""
     g_i: Float[Array, "e d"]
+    """Gradient for the first vertex."""
     g_j: Float[Array, "e d"]
+    """Gradient for the second vertex."""
 
 
 def residuals(T_world_i: Poses, T_world_j: Poses, graph: PoseGraph) -> Float[Array, "e d"]:
     """Return Log(Z^-1 T_i^-1 T_j) of each edge, Log(Z^-1 T_j) of a prior, (0, T_j l - z) of a position.
 
     Args:
-        T_world_i: (e,) poses of the edges' first vertices.
-        T_world_j: (e,) of their second ones.
-        graph: that the edges belong to.
+        T_world_i: (e,) poses of the edges' first vertices, m.
+        T_world_j: (e,) poses of the edges' second vertices, m.
+        graph: the graph of the edges.
+
+    Returns:
+        The residuals, rotation (rad) before translation (m).
     """
     return _residual(_missed(between(T_world_i, T_world_j), T_world_j, graph), T_world_j, graph)
 
@@ -51,9 +59,13 @@ def edge_costs(poses: Poses, graph: PoseGraph) -> Float[Array, " e"]:
 def linearise(poses: Poses, graph: PoseGraph) -> Linearised:
     """Return cost, gradient and Gauss-Newton Hessian of each edge, in closed form.
 
-    With E = Z^-1 T_i^-1 T_j perturbations move it by E exp(d_j - Ad(T_j^-1 T_i) d_i), and Log(E exp(d)) by
-    J_r^-1 d: what holds for j holds for i after a product with -Ad. A position's lever l moves by
+    Perturbations change E = Z^-1 T_i^-1 T_j to E exp(d_j - Ad(T_j^-1 T_i) d_i), and Log(E exp(d)) changes by
+    J_r^-1 d. So the derivative by d_i is that by d_j times -Ad. The point of a position with lever l moves by
     R_j (v + w x l) for d = (w, v).
+
+    Args:
+        poses: (n,) T_world_vertex, m, at which to linearise.
+        graph: the graph of the edges.
     """
     T_world_i, T_world_j = computed_once((picked(poses, graph.i), picked(poses, graph.j)))
     across = rotation_first(between(T_world_j, T_world_i).adjoint(), axes=2)
@@ -80,8 +92,12 @@ def right_jacobian_inverse(tangent: Float[Array, "e d"]) -> Float[Array, "e d d"
     """Return the derivative of Log(exp(tangent) exp(d)) at d = 0.
 
     J_r^-1 = I + ad / 2 + a ad^2 + b ad^4 with a = 2 / x^2 + (x + 3 sin x) / (4 x (cos x - 1)) and
-    b = 1 / x^4 + (x + sin x) / (4 x^3 (cos x - 1)), x the angle (Bullo & Murray, "Proportional derivative
-    (PD) control on the Euclidean group", 1995); in the plane ad^4 = -x^2 ad^2 and the same holds.
+    b = 1 / x^4 + (x + sin x) / (4 x^3 (cos x - 1)), where x is the angle (Bullo & Murray, "Proportional
+    derivative (PD) control on the Euclidean group", 1995). In the plane ad^4 = -x^2 ad^2, and the formula
+    holds as well.
+
+    Args:
+        tangent: rotation (rad) before translation (m), d = 6 in space and 3 in the plane.
     """
     rotation = tangent[:, :3] if tangent.shape[-1] == 6 else tangent[:, :1]
     squared = jnp.sum(rotation**2, -1)
@@ -102,7 +118,7 @@ def right_jacobian_inverse(tangent: Float[Array, "e d"]) -> Float[Array, "e d d"
 
 
 def _missed(T_i_j: Poses, T_world_j: Poses, graph: PoseGraph) -> Poses:
-    """Return the pose of j as measured to where it is: Z^-1 T_i_j, Z^-1 T_world_j for one vertex alone."""
+    """Return the error Z^-1 T_i_j of an edge between two vertices, Z^-1 T_world_j of one on one vertex."""
     alone = _is_unary(graph)[:, None]
     T_i_j = jax.tree.map(lambda single, both: jnp.where(alone, single, both), T_world_j, T_i_j)
     return between(graph.measurement, T_i_j)
@@ -159,7 +175,7 @@ def _ad(tangent: Float[Array, "e d"]) -> Float[Array, "e d d"]:
 
 
 def _product(left: Float[Array, "e d d"], right: Float[Array, "e d d"]) -> Float[Array, "e d d"]:
-    """Return the products of small matrices in one vectorised loop; XLA's own is a call for each of them."""
+    """Return products of small matrices in one vectorised loop; XLA's own product makes a call for each."""
     terms = [left[..., :, k, None] * right[..., None, k, :] for k in range(left.shape[-1])]
     return sum(terms[1:], terms[0])
 

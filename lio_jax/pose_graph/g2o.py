@@ -21,20 +21,27 @@ _Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Edge:
-    """A relative pose between two vertices."""
+    """A measured relative pose between two vertices."""
 
     i: int
+    """Number of the first vertex."""
     j: int
+    """Number of the second vertex."""
     T_i_j: NDArray[np.float64]
-    """(4, 4)."""
+    """(4, 4) pose of the second vertex in the frame of the first, m."""
     information: NDArray[np.float64]
-    """(6, 6) of the right perturbation of T_i_j: rotation (rad) before translation (m)."""
+    """(6, 6) information of the right perturbation of T_i_j: rotation (rad) before translation (m)."""
 
 
 def write_g2o(path: Path, poses: NDArray[np.float64], edges: list[Edge]) -> None:
-    """Write (n, 4, 4) vertices and their edges.
+    """Write vertices in space and their edges.
 
-    The file holds translation first; like gtsam, rotations count as rotation vectors.
+    The information in the file is that of (translation, rotation vector), as in gtsam.
+
+    Args:
+        path: path of the file.
+        poses: (n, 4, 4) T_world_vertex, m.
+        edges: relative poses between the vertices.
     """
     measured = np.array([edge.T_i_j for edge in edges]).reshape(-1, 4, 4)
     information = np.array([edge.information for edge in edges]).reshape(-1, 6, 6)
@@ -48,12 +55,12 @@ def write_graph(path: Path, graph: PoseGraph, ids: NDArray[np.int64]) -> None:
     """Write a graph of odometry and loops.
 
     Args:
-        path: of the file.
-        graph: without priors and positions, which the format's usual tags don't tell.
-        ids: (n,) numbers of the vertices.
+        path: path of the file.
+        graph: a graph without priors and positions, for which the format has no usual tags.
+        ids: (n,) numbers of the vertices in the file.
 
     Raises:
-        ValueError: there are priors or positions.
+        ValueError: the graph has priors or positions.
     """
     if np.any(np.asarray(graph.kind) >= PRIOR):
         raise ValueError("g2o's usual tags tell neither priors nor positions")
@@ -67,13 +74,13 @@ def write_graph(path: Path, graph: PoseGraph, ids: NDArray[np.int64]) -> None:
 
 
 def _of_matrices(poses: _Array) -> _Array:
-    """Return rows x y z qx qy qz qw."""
+    """Return the rows x y z qx qy qz qw of (n, 4, 4) poses."""
     quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat().reshape(-1, 4)
     return np.hstack([poses[:, :3, 3], quaternion])
 
 
 def _of_poses(poses: Poses) -> _Array:
-    """Return rows x y z qx qy qz qw, in the plane x y angle."""
+    """Return the rows x y z qx qy qz qw of poses; in the plane the rows x y angle."""
     numbers = numbers_of(poses)
     if isinstance(poses, jaxlie.SE3):
         return numbers[:, [4, 5, 6, 1, 2, 3, 0]]
@@ -81,7 +88,7 @@ def _of_poses(poses: Poses) -> _Array:
 
 
 def _triangle(information: _Array) -> _Array:
-    """Return the upper triangles, translation first, of matrices that count rotation first."""
+    """Return the upper triangles, in the order translation first, of matrices in the order rotation first."""
     size = information.shape[-1]
     turned = np.roll(information, -3 if size == 6 else -1, axis=(1, 2))
     return turned[:, *np.triu_indices(size)]
@@ -100,13 +107,16 @@ def _write(path: Path, lines: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class _Layout:
-    """How a kind of pose is written."""
+    """The format of a kind of pose."""
 
     vertex: str
+    """Tag of a vertex's line."""
     edge: str
+    """Tag of an edge's line."""
     pose_numbers: int
+    """Count of the numbers of a pose."""
     size: int
-    """Of a tangent."""
+    """Size of a tangent vector."""
 
 
 SPACE = _Layout("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", 7, 6)
@@ -116,22 +126,26 @@ _FIX = "FIX"
 
 @dataclass(frozen=True)
 class G2oFile:
-    """What a file holds."""
+    """The content of a g2o file."""
 
     graph: PoseGraph
+    """The pose graph; its kinds of edge are odometry and loop."""
     ids: NDArray[np.int64]
-    """(n,) the vertices' numbers in the file."""
+    """(n,) numbers of the vertices in the file."""
     has_poses: bool
-    """False: the file has edges alone, and the graph's poses are the identity."""
+    """False if the file has edges only; the graph's poses are then the identity."""
     notes: tuple[str, ...]
-    """Sentences on what the file's reader should know."""
+    """Sentences on unusual content of the file, for the user."""
 
 
 def read_g2o(path: Path) -> G2oFile:
-    """Return the pose graph that a file holds.
+    """Return the pose graph of a g2o file.
 
-    Edges between vertices whose numbers follow on each other count as odometry, all others as loops. The
-    information is taken as that of (x, y, z, rotation vector), as gtsam does.
+    Edges between vertices whose numbers are neighbours in sorted order count as odometry, others as loops.
+    The information is that of (x, y, z, rotation vector), as in gtsam.
+
+    Args:
+        path: path of the file.
 
     Raises:
         LioJaxError: the file cannot be read as a pose graph; the message names the line.
@@ -202,7 +216,7 @@ def _layout(path: Path, numbers: dict[str, list[int]]) -> _Layout:
 def _table(
     path: Path, lines: Sequence[str], at: NDArray[np.int64], whole: int, real: int
 ) -> tuple[NDArray[np.int64], _Array]:
-    """Return vertices' numbers and the other numbers behind the tags of some lines, all parsed at once."""
+    """Return the vertices' numbers and the real numbers of some lines; all lines are parsed at once."""
     words = " ".join([lines[number] for number in at.tolist()]).split()
     columns = 1 + whole + real
     if len(words) == len(at) * columns:
@@ -257,7 +271,7 @@ def _index(
     wanted: NDArray[np.int64],
     at: NDArray[np.int64],
 ) -> NDArray[np.int64]:
-    """Return which vertex each number means."""
+    """Return the index of the vertex with each wanted number."""
     found = order[np.minimum(np.searchsorted(ids, wanted, sorter=order), len(ids) - 1)]
     missing = ids[found] != wanted
     if np.any(missing):
@@ -269,7 +283,7 @@ def _index(
 def _fixed(
     path: Path, lines: Sequence[str], at: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the numbers of the vertices that FIX lines hold, of which each may name several, and where."""
+    """Return the numbers of the vertices that FIX lines name, one or several in a line, and their lines."""
     words = [(word, number) for number in at.tolist() for word in lines[number].split()[1:]]
     for word, number in words:
         if not word.isdecimal():
@@ -285,7 +299,7 @@ def _identities(count: int, layout: _Layout) -> _Array:
 
 
 def _poses(path: Path, numbers: _Array, at: NDArray[np.int64]) -> Poses:
-    """Return poses of rows (x, y, z, qx, qy, qz, qw) or (x, y, angle)."""
+    """Return the poses of rows (x, y, z, qx, qy, qz, qw) or (x, y, angle)."""
     if numbers.shape[1] == PLANE.pose_numbers:
         turn = np.stack([np.cos(numbers[:, 2]), np.sin(numbers[:, 2])], -1)
         return jaxlie.SE2(jax.device_put(np.concatenate([turn, numbers[:, :2]], -1)))
@@ -296,7 +310,7 @@ def _poses(path: Path, numbers: _Array, at: NDArray[np.int64]) -> Poses:
 
 
 def _information(path: Path, triangle: _Array, layout: _Layout, at: NDArray[np.int64]) -> _Array:
-    """Return matrices, rotation first, of upper triangles, translation first."""
+    """Return matrices in the order rotation first from upper triangles in the order translation first."""
     rows, columns = np.triu_indices(layout.size)
     matrix = np.zeros((len(triangle), layout.size, layout.size))
     matrix[:, rows, columns] = matrix[:, columns, rows] = triangle

@@ -1,4 +1,4 @@
-"""Distrust edges that contradict the others, by graduated non-convexity."""
+"""Reject edges that contradict the others, by graduated non-convexity."""
 
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -23,54 +23,56 @@ from lio_jax.pose_graph.structure import Structure, parts_of, structure_of
 _Array = NDArray[np.float64]
 
 _GROWTH = 1.4
-"""Of the control parameter, from one set of weights to the next."""
+"""Factor of the control parameter from one set of weights to the next."""
 _ROUNDS = 200
+"""Largest number of sets of weights."""
 _ON_THE_WAY = Limits(iterations=10, tolerance=1e-4)
+"""Conditions that end the descents before the last one."""
 _SHRUNK = 0.9
-"""When only this share of the edges still has a weight the order of elimination is found anew."""
+"""Share of the edges with a weight below which a new order of elimination is found."""
 _SETTLED = 1e-3
-"""Weights this near to 0 or 1 change no more."""
+"""Distance from 0 or 1 below which a weight counts as final."""
 
 
 @dataclass(frozen=True)
 class Robust:
-    """Which edges may be wrong, and from when on they are."""
+    """Which edges may be wrong, and how large the residual of a correct edge may be."""
 
     confidence: float = 0.99
-    """Share of right edges whose r' Omega r is below the limit, by the chi-square distribution."""
+    """Share of correct edges whose r' Omega r is below the limit, by the chi-square distribution."""
     trusted_kinds: tuple[int, ...] = (ODOMETRY, PRIOR)
-    """Edges that are taken to be right."""
+    """Kinds of edges that are taken to be correct."""
     begin: Literal["trusted", "given"] = "trusted"
-    """Whose residuals come first: those at the poses that the trusted edges ask for, which finds the right
-    ones among many wrong edges; or at the given poses, such as the best ones with all edges, which finds a
-    few wrong edges among right ones that the trusted edges contradict together."""
+    """Poses of the first residuals. "trusted": the poses that agree best with the trusted edges; this finds
+    the correct edges among many wrong ones. "given": the given poses, for example the best ones with all
+    edges; this finds a few wrong edges if all correct ones contradict the trusted edges in the same way."""
 
 
 class Graduated(NamedTuple):
-    """Where the graduation ended."""
+    """The result of the graduation."""
 
     descent: Descent
+    """The last descent, with the count of iterations of all descents."""
     weights: _Array
-    """(e,) 0 or 1, seldom between."""
+    """(e,) weight of each edge, 0 or 1 and rarely between."""
 
 
 def graduate(
     graph: PoseGraph, structure: Structure, padded: Padded, poses: Poses, robust: Robust, limits: Limits
 ) -> Graduated:
-    """Return poses and weights of the truncated least squares, beginning with a convex problem.
+    """Return poses and weights of a truncated least-squares problem, beginning with a convex approximation.
 
-    GNC-TLS of Yang, Antonante, Tzoumas & Carlone, "Graduated non-convexity for robust spatial perception:
-    from non-minimal solvers to global outlier rejection", RA-L 2020. The first residuals are those at the
-    poses that the trusted edges ask for, where these connect all vertices, else at ``poses``.
+    This is GNC-TLS of Yang, Antonante, Tzoumas & Carlone, "Graduated non-convexity for robust spatial
+    perception: from non-minimal solvers to global outlier rejection", RA-L 2020.
 
     Args:
-        graph: as it is.
-        structure: of the graph.
+        graph: vertices and edges, without padding.
+        structure: structure of the graph.
         padded: the graph at its padded size.
-        poses: to begin with where ``robust.begin`` says so, or the trusted edges don't connect the graph; of
-            the padded size.
+        poses: first poses, at the padded size. They are used if ``robust.begin`` is "given", or if the
+            trusted edges do not connect all vertices.
         robust: which edges may be wrong.
-        limits: of the last descent, with the weights found.
+        limits: conditions that end the last descent, which has the final weights.
     """
     doubted = ~np.isin(structure.kind, robust.trusted_kinds)
     size = np.where(
@@ -85,7 +87,7 @@ def graduate(
         poses = padded_poses(start, len(padded.graph.fixed))
 
     def solved(poses: Poses, limits: Limits) -> Descent:
-        """Descend with today's weights; edges that have none make no fill."""
+        """Descend with the current weights; edges of weight 0 cause no fill-in."""
         nonlocal padded, structure
         if np.sum(weights > 0) < _SHRUNK * np.sum(structure.used) or np.any((weights > 0) & ~structure.used):
             structure = structure_of(graph, weights > 0)
@@ -110,11 +112,14 @@ def graduate(
 
 
 def truncated_weights(squared: _Array, control: float) -> _Array:
-    """Return the weights of edges under the truncated square made convex by a control parameter.
+    """Return the weights of edges for a truncated square that a control parameter makes convex.
 
     Args:
-        squared: squared whitened residuals as shares of the limit above which an edge counts as wrong.
-        control: mu: 0 makes the problem convex, infinity leaves it as it is.
+        squared: (e,) squared whitened residuals over the limit above which an edge counts as wrong.
+        control: the parameter mu: 0 is the convex problem, infinity the truncated square itself.
+
+    Returns:
+        (e,) weights from 0 to 1.
     """
     if np.isinf(control):
         return (squared <= 1).astype(np.float64)

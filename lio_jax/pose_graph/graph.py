@@ -1,4 +1,8 @@
-"""Pose graphs as arrays, and poses in double precision on the host."""
+"""Pose graphs as arrays, and operations on batches of poses.
+
+Functions of the first part run on the device, in space (SE3) and in the plane (SE2). Functions of the second
+part convert poses to and from matrices on the host, in double precision.
+"""
 
 from typing import Literal
 
@@ -12,60 +16,61 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 Poses = jaxlie.SEBase
-"""SE3 or SE2, all of one kind, with one batch axis."""
+"""SE3 or SE2 poses, all of one kind, with one batch axis."""
 
 ODOMETRY, LOOP, PRIOR, POSITION = range(4)
-"""Kinds of edge. A prior states a vertex's pose, a position where a point fixed to it is, such as a GPS
-antenna."""
+"""Kinds of edge. A prior measures a vertex's pose. A position measures where a point is that is fixed to the
+vertex, for example a GPS antenna."""
 
 
 class PoseGraph(eqx.Module):
-    """Vertices and what was measured about them."""
+    """Vertices, and the measurements between and of them."""
 
     poses: Poses
-    """(n,) estimates, T_world_vertex."""
+    """(n,) estimates of T_world_vertex, m."""
     i: Int[Array, " e"]
-    """First vertex of each edge; of a prior and of a position the same as ``j``."""
+    """First vertex of each edge; for a prior and for a position the same as ``j``."""
     j: Int[Array, " e"]
-    """Second vertex."""
+    """Second vertex of each edge."""
     measurement: Poses
-    """(e,) T_i_j; T_world_j of a prior; of a position only the translation counts."""
+    """(e,) measured T_i_j, m; for a prior T_world_j; for a position only the translation is used."""
     information: Float[Array, "e d d"]
-    """Inverse covariance of the measurement's right perturbation; of a position, of its coordinates in the
-    world, with zeros for the rotation."""
+    """Inverse covariance of the measurement's right perturbation, rotation (rad) before translation (m). For
+    a position it is that of the coordinates in world, with zeros for the rotation."""
     kind: Int[Array, " e"]
-    """ODOMETRY, LOOP, PRIOR or POSITION."""
+    """Kind of each edge: ODOMETRY, LOOP, PRIOR or POSITION."""
     fixed: Bool[Array, " n"]
-    """Vertices that keep their pose."""
+    """True for vertices that keep their pose."""
     lever: Float[Array, "e k"] | None = None
-    """Of a position: the point whose place was measured, in the frame of ``j``, m; of other edges not looked
-    at. None: all positions are those of the vertices' own origins."""
+    """Point whose position was measured, in the frame of ``j``, m; not used for other kinds of edge. None:
+    the origin of ``j``."""
 
 
 Status = Literal["converged", "iteration limit", "no further decrease", "not finite"]
-"""How a solve ended. "no further decrease": no step, however short, lowered the cost."""
+"""Why a solve ended. "no further decrease": even the shortest step did not lower the cost."""
 
 
 class Solution(eqx.Module):
-    """What a solve found."""
+    """The result of a solve."""
 
     poses: Poses
-    """(n,) T_world_vertex."""
+    """(n,) T_world_vertex, m."""
     cost: Float[Array, ""]
-    """Half the weighted sum of squared whitened residuals."""
+    """Half of the weighted sum of squared whitened residuals."""
     weights: Float[Array, " e"]
-    """Of each edge's information: 1, or below where a robust solve distrusts an edge."""
+    """Factor of each edge's information: 1, or less where a robust solve rejects an edge."""
     edge_costs: Float[Array, " e"]
-    """r' Omega r / 2 of each edge, whatever its weight."""
+    """r' Omega r / 2 of each edge, without its weight."""
     initial_cost: Float[Array, ""]
-    """Cost of the graph's own poses, all edges trusted."""
+    """Cost at the graph's own poses, with weight 1 for all edges."""
     iterations: int = eqx.field(static=True)
-    """Linear systems solved."""
+    """Number of linear systems solved."""
     status: Status = eqx.field(static=True)
+    """Why the solve ended."""
 
 
 def rotation_first(tangent_or_matrix: Float[Array, "*b"], axes: int = 1) -> Float[Array, "*b"]:
-    """Return jaxlie's tangents (translation first) in this project's order.
+    """Return jaxlie's tangents, which have the translation first, with the rotation first.
 
     Args:
         tangent_or_matrix: its last ``axes`` axes are of a tangent's size, 6 or 3.
@@ -76,16 +81,21 @@ def rotation_first(tangent_or_matrix: Float[Array, "*b"], axes: int = 1) -> Floa
 
 
 def moved(poses: Poses, step: Float[Array, "n d"]) -> Poses:
-    """Return T exp(step)."""
+    """Return T exp(step).
+
+    Args:
+        poses: (n,) poses T, m.
+        step: right perturbations, rotation (rad) before translation (m).
+    """
     size = step.shape[-1]
     return poses @ type(poses).exp(jnp.roll(step, -3 if size == 6 else -1, axis=-1))
 
 
 def between(a: Poses, b: Poses) -> Poses:
-    """Return a^-1 b, of (n,) and (n,) poses.
+    """Return a^-1 b for (n,) poses a and (n,) poses b.
 
-    In space column by column: each of jaxlie's own products, of quaternions and with points, costs XLA
-    as much as all of this.
+    In space the product is written component by component: each single product of jaxlie, of quaternions or
+    with points, costs XLA as much as this whole function.
     """
     if not isinstance(a, jaxlie.SE3):
         return a.inverse() @ b
@@ -110,33 +120,35 @@ def between(a: Poses, b: Poses) -> Poses:
 
 
 def picked(poses: Poses, index: Int[Array, " k"]) -> Poses:
-    """Return the poses at these places."""
+    """Return the (k,) poses at the given indices."""
     return jax.tree.map(lambda leaf: leaf[index], poses)
 
 
 def tangent_size(poses: Poses) -> int:
-    """Return 6 in space, 3 in the plane."""
+    """Return the size of a tangent vector: 6 in space, 3 in the plane."""
     return poses.tangent_dim
 
 
 _Array = NDArray[np.float64]
 
 _WELL_CONDITIONED = 0.1
-"""Determinant of a matrix over that of the rotation's multiple that is as large."""
+"""Least determinant of a matrix for which the iteration is used, over that of a multiple of a rotation with
+the same norm."""
 _STEPS = 10
+"""Largest number of iterations for the nearest rotation."""
 
 
 def numbers_of(poses: Poses) -> _Array:
-    """Return what the poses are made of: (w, x, y, z) or (cosine, sine), then the translation.
+    """Return the poses' parameters: (w, x, y, z) or (cosine, sine), then the translation (m).
 
-    jaxlie's own ``parameters()`` is compiled for every number of poses.
+    jaxlie's own ``parameters()`` would compile for each number of poses.
     """
     (numbers,) = jax.tree.leaves(poses)
     return np.asarray(numbers)
 
 
 def rotation_matrices(poses: Poses) -> _Array:
-    """Return (n, 3, 3), in the plane (n, 2, 2)."""
+    """Return the rotation matrices, (n, 3, 3) in space and (n, 2, 2) in the plane."""
     numbers = numbers_of(poses)
     if isinstance(poses, jaxlie.SE3):
         return Rotation.from_quat(numbers[:, :4], scalar_first=True).as_matrix().reshape(-1, 3, 3)
@@ -145,12 +157,12 @@ def rotation_matrices(poses: Poses) -> _Array:
 
 
 def translations(poses: Poses) -> _Array:
-    """Return (n, 3), in the plane (n, 2)."""
+    """Return the translations, m, (n, 3) in space and (n, 2) in the plane."""
     return numbers_of(poses)[:, 4 if isinstance(poses, jaxlie.SE3) else 2 :]
 
 
 def matrices_of(poses: Poses) -> _Array:
-    """Return (n, 4, 4), in the plane (n, 3, 3)."""
+    """Return the homogeneous matrices, (n, 4, 4) in space and (n, 3, 3) in the plane."""
     translation = translations(poses)
     size = translation.shape[-1]
     matrices = np.tile(np.eye(size + 1), (len(translation), 1, 1))
@@ -160,7 +172,12 @@ def matrices_of(poses: Poses) -> _Array:
 
 
 def poses_from(rotation: _Array, translation: _Array) -> Poses:
-    """Return the poses of rotation matrices, (n, 3, 3) or (n, 2, 2), and translations."""
+    """Return the poses of rotation matrices and translations.
+
+    Args:
+        rotation: (n, 3, 3) or (n, 2, 2).
+        translation: (n, 3) or (n, 2), m.
+    """
     if translation.shape[-1] == 2:
         return jaxlie.SE2(jax.device_put(np.concatenate([rotation[:, :, 0], translation], -1)))
     wxyz = Rotation.from_matrix(rotation).as_quat(scalar_first=True).reshape(-1, 4)
@@ -170,10 +187,10 @@ def poses_from(rotation: _Array, translation: _Array) -> Poses:
 def nearest_rotations(matrix: _Array) -> _Array:
     """Return the rotation matrices that are nearest to (n, k, k) matrices, in the Frobenius norm.
 
-    ``U diag(1, .., det(U V')) V'`` of the singular value decomposition (Umeyama, "Least-squares estimation of
-    transformation parameters between two point patterns", 1991). For matrices not far from a multiple of a
-    rotation it is the limit of X <- (X + X^-T) / 2 (Higham, "Computing the polar decomposition with
-    applications", 1986), in a tenth of the time.
+    The nearest rotation is ``U diag(1, .., det(U V')) V'`` of the singular value decomposition (Umeyama,
+    "Least-squares estimation of transformation parameters between two point patterns", 1991). For 3 x 3
+    matrices near a multiple of a rotation it is computed as the limit of X <- (X + X^-T) / 2 (Higham,
+    "Computing the polar decomposition with applications", 1986), which takes a tenth of the time.
     """
     size = matrix.shape[-1]
     determinant = np.linalg.det(matrix)
@@ -200,7 +217,7 @@ def _orthogonalised(matrix: _Array) -> _Array:
         cofactors = np.stack([np.cross(b, c, axis=0), np.cross(c, a, axis=0), np.cross(a, b, axis=0)])
         change = (cofactors / np.sum(a * cofactors[0], 0) - X) / 2
         X = X + change
-        # the error falls with its square
+        # the convergence is quadratic
         if np.max(np.abs(change)) < 1e-8:
             break
     return X.transpose(2, 0, 1)

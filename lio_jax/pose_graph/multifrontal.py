@@ -1,7 +1,8 @@
-"""Sparse Cholesky factorisation of matrices made of small square blocks, front by front (multifrontal).
+"""Sparse Cholesky factorisation of matrices of small square blocks by the multifrontal method, on the host.
 
-On the host: every front is a dense matrix for LAPACK. Duff & Reid, "The multifrontal solution of indefinite
-sparse symmetric linear equations", 1983.
+Every front is a dense matrix for LAPACK.
+
+Source: Duff & Reid, "The multifrontal solution of indefinite sparse symmetric linear equations", 1983.
 """
 
 from contextlib import AbstractContextManager
@@ -21,40 +22,44 @@ _Runs = tuple[_Run, ...]
 
 @dataclass(frozen=True)
 class _Share:
-    """Where rows that a child is left with lie in its parent, run by run (child's, parent's)."""
+    """Where the rows of a child's Schur complement lie in its parent, as runs (rows of child, of parent)."""
 
     in_panel: _Runs
+    """Runs in the parent's panel."""
     in_rest: _Runs
+    """Runs in the parent's own Schur complement."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """All that does not depend on the numbers of a matrix of d by d blocks.
+    """The plan of a factorisation, for all matrices of d by d blocks with one pattern.
 
-    A front's panel is its columns: its own nodes' rows first, then those of its ``rows``.
+    A front's panel holds its columns: first the rows of its own nodes, then those of its ``rows``.
     """
 
     tree: EliminationTree
+    """Order of elimination."""
     size: int
-    """d, the side of a block."""
+    """Number d of rows of a block."""
     places: NDArray[np.int64]
-    """(n + m, d, d) of the blocks' entries in the panels, which lie one behind the other."""
+    """(n + m, d, d) places of the blocks' entries in one array of all panels."""
     offsets: tuple[int, ...]
-    """Where each front's panel begins, and where the last one ends."""
+    """Place where each front's panel begins, and where the last one ends."""
     shares: tuple[_Share | None, ...]
+    """Places of each front's Schur complement in its parent; None without a parent."""
     own: tuple[slice, ...]
-    """Where a front's own nodes lie in a vector in the order of elimination."""
+    """Places of each front's own nodes in a vector in the order of elimination."""
     rows: tuple[NDArray[np.int64], ...]
-    """Where the nodes lie that they are coupled to."""
+    """Places of the nodes to which each front's own nodes are coupled."""
 
 
 def plan_of(pairs: NDArray[np.int64], size: int, tree: EliminationTree) -> Plan:
     """Return the plan of a matrix with n diagonal blocks and m blocks at (pairs[k, 0], pairs[k, 1]).
 
     Args:
-        pairs: (m, 2) rows and columns of blocks, each below or above the diagonal and none twice.
-        size: side of a block.
-        tree: of the same pairs.
+        pairs: (m, 2) row and column of each block, below or above the diagonal; no pair occurs twice.
+        size: number of rows of a block.
+        tree: elimination tree of the same pairs.
     """
     fronts = tree.fronts
     widths = np.array([front.stop - front.start for front in fronts], np.int64)
@@ -104,7 +109,7 @@ def _places(
 
 
 def _shares(tree: EliminationTree, size: int) -> tuple[_Share | None, ...]:
-    """Return where what each front is left with lies in its parent, as runs of consecutive rows."""
+    """Return where each front's Schur complement lies in its parent, as runs of consecutive rows."""
     fronts, count = tree.fronts, len(tree.position)
     rows = np.concatenate([front.rows for front in fronts] + [np.zeros(0, np.int64)])
     lengths = np.array([len(front.rows) for front in fronts], np.int64)
@@ -147,7 +152,9 @@ class Factor:
     """The Cholesky factor of a matrix, as one panel per front."""
 
     plan: Plan
+    """Plan of the matrix's pattern."""
     panels: tuple[NDArray[np.float64], ...]
+    """Columns of the factor for each front."""
 
 
 @cache
@@ -158,8 +165,8 @@ def _libraries() -> ThreadpoolController:
 def one_thread() -> AbstractContextManager:
     """Return a context in which BLAS runs on one thread.
 
-    The fronts are small: its threads would wait for each other, and for hundreds of times as long where other
-    programs want the processor too.
+    The fronts are small, so the threads of BLAS would wait for each other. Where other programs use the
+    processor as well, they would wait hundreds of times as long.
     """
     return _libraries().limit(limits=1, user_api="blas")
 
@@ -168,11 +175,11 @@ def factorise(plan: Plan, blocks: NDArray[np.float64]) -> Factor:
     """Return the factor of a symmetric matrix.
 
     Args:
-        plan: of its pattern.
-        blocks: (n + m, d, d): the diagonal's, then one for each pair.
+        plan: plan of the matrix's pattern.
+        blocks: (n + m, d, d) blocks on the diagonal, then those of the pairs.
 
     Raises:
-        NotPositiveDefiniteError: it is not positive definite.
+        NotPositiveDefiniteError: the matrix is not positive definite.
     """
     size = plan.size
     numbers = np.zeros(plan.offsets[-1])
@@ -186,7 +193,7 @@ def factorise(plan: Plan, blocks: NDArray[np.float64]) -> Factor:
         for share, update in waiting[index]:
             _extend_add(share, update, panel, left, width)
         waiting[index].clear()
-        # LAPACK counts columns first: what it takes for an upper triangle is our lower one
+        # LAPACK stores columns first: its upper triangle is the lower one here
         _, failed = lapack.dpotrf(panel[:width].T, lower=0, clean=0, overwrite_a=1)
         if failed:
             raise NotPositiveDefiniteError
@@ -207,7 +214,7 @@ def _extend_add(
     left: NDArray[np.float64],
     width: int,
 ) -> None:
-    """Add what a child is left with to its parent; of symmetric matrices the lower triangle."""
+    """Add the lower triangle of a child's Schur complement to its parent."""
     for number, (column, to_column) in enumerate(share.in_panel):
         for row, to_row in share.in_panel[number:]:
             panel[to_row, to_column] += update[row, column]
@@ -219,7 +226,15 @@ def _extend_add(
 
 
 def solve(factor: Factor, right: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the solution of A x = right for (n, d) or (n, d, k) right-hand sides."""
+    """Return the solution x of A x = right.
+
+    Args:
+        factor: Cholesky factor of A.
+        right: (n, d) right-hand side, or (n, d, k) for k of them.
+
+    Returns:
+        x, of the shape of ``right``.
+    """
     plan = factor.plan
     position = plan.tree.position
     ordered = np.empty((len(position), plan.size, *right.shape[2:]))

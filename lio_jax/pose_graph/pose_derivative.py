@@ -1,4 +1,4 @@
-"""The derivative of a pose graph's solution with respect to what was measured and how far it is trusted."""
+"""The derivative of a pose graph's solution with respect to measurements, information and fixed poses."""
 
 from functools import partial
 
@@ -21,21 +21,23 @@ from lio_jax.pose_graph.structure import Structure, structure_from, structure_of
 
 _STRICT = Limits(tolerance=1e-12)
 _NEWTON_STEPS = 2
+"""Number of Newton steps with the exact Hessian after the descent."""
 
 
 def solved_poses(graph: PoseGraph, limits: Limits = _STRICT) -> Poses:
     """Return the poses of least cost, with their derivative by measurements, information and fixed poses.
 
     Where the gradient g(x, q) of the cost vanishes, dx = -(dg/dx)^-1 (dg/dq) dq (implicit function theorem),
-    with the exact Hessian dg/dx: one sparse factorisation for all tangents, or cotangents. Gauss-Newton steps
-    end near such a point; Newton's own lead to its last digit.
+    with the exact Hessian dg/dx. One sparse factorisation serves all tangents, or all cotangents.
+    Gauss-Newton steps end near such a point; Newton steps then reach it with full precision.
 
-    Call it outside ``jit``: the host finds the solution. ``solve`` gives its status.
+    Call it outside ``jit``, because the host finds the solution. :func:`~lio_jax.pose_graph.pose_graph.solve`
+    returns the status of the solve, which this function does not return.
 
     Args:
-        graph: vertices and edges; scale ``information`` to weight edges. Poses of vertices that are not held
-            don't matter.
-        limits: of the Gauss-Newton steps.
+        graph: vertices and edges; scale ``information`` to weight edges. The result does not depend on the
+            poses of vertices that are not held.
+        limits: conditions that end the Gauss-Newton steps.
     """
     held = jax.device_put(structure_of(graph).held)
     problem = Problem(
@@ -61,7 +63,7 @@ def _root(limits: Limits, inputs: tuple[PoseGraph, Array]) -> Root:
 
 @jax.jit
 def _poses_at(step: Float[Array, " u"], numbers: Array, graph: PoseGraph, held: Bool[Array, " n"]) -> Poses:
-    """Return the poses a step away from the solution; held ones are those of the graph."""
+    """Return the poses after a step from the solution; held vertices have the graph's own poses."""
     found = moved(type(graph.poses)(numbers), step.reshape(len(held), -1))
     return jax.tree.map(lambda own, found: jnp.where(held[:, None], own, found), graph.poses, found)
 
@@ -81,7 +83,7 @@ def _gradient(
 def _solve_hessian(
     step: Float[Array, " u"], numbers: Array, inputs: tuple[PoseGraph, Array], right: Float[Array, " u"]
 ) -> Float[Array, " u"]:
-    """Return H^-1 right, with the identity in place of the rows of H that belong to held vertices."""
+    """Return H^-1 right, where the rows of H that belong to held vertices are those of the identity."""
     graph, held = jax.lax.stop_gradient(inputs)
     hessians = _edge_hessians(type(graph.poses)(numbers), graph)
     shape = jax.ShapeDtypeStruct(right.shape, right.dtype)
@@ -136,7 +138,7 @@ def _solve_on_host(
 def _blocks(
     structure: Structure, hessians: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the Hessian's blocks on the diagonal, then those of the pairs."""
+    """Return the Hessian's blocks on the diagonal, and those of the pairs."""
     size = structure.tangent_size
     i, j = structure.unknown[structure.i], structure.unknown[structure.j]
     H_ij = hessians[:, :size, size:]

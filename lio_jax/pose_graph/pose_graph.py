@@ -1,11 +1,11 @@
-"""Solve pose graphs: the poses that agree best with all that was measured.
+"""Solve pose graphs: find the poses that agree best with all measurements.
 
     graph = read_g2o(path).graph
     solution = solve(graph)
     covariances = marginal_covariances(graph, solution, [10, 20])
 
-The device linearises all edges at once, the host eliminates: programs are compiled for a few sizes only, and
-the order of elimination is found once per graph.
+The device linearises all edges at once, and the host solves the linear systems. Programs are compiled for a
+few sizes only, and the order of elimination is found once for each graph.
 """
 
 from collections.abc import Sequence
@@ -47,23 +47,24 @@ def solve(
 ) -> Solution:
     """Return the poses of least cost.
 
-    The cost is half the sum of r' Omega r with r = Log(Z^-1 T_i^-1 T_j), as in gtsam. Where nothing ties a
-    connected part of the graph to the world its first vertex keeps its pose.
+    The cost is half the sum of r' Omega r with r = Log(Z^-1 T_i^-1 T_j), as in gtsam. If no fixed vertex,
+    prior or position connects a part of the graph with the world, the first vertex of that part keeps its
+    pose.
 
     Args:
         graph: vertices and edges.
-        start: "chordal" finds the first guess from the edges; "poses" begins at the graph's own, for one that
-            was solved before and has grown a little.
+        start: "chordal" finds the first guess from the edges. "poses" begins at the graph's own poses, for a
+            graph that was solved before and has grown a little.
         robust: which edges may be wrong; None: all are trusted.
-        limits: when to end; None: the usual ones.
-        structure: of this graph, where it is known from an earlier solve.
+        limits: conditions that end the solve; None: the defaults of :class:`Limits`.
+        structure: structure of this graph, if it is known from an earlier solve.
     """
     with one_thread():
         return _solve(graph, start, robust, limits or Limits(), structure or structure_of(graph))
 
 
 def compile_for(graph: PoseGraph) -> None:
-    """Compile what a solve of this graph needs, as far as no graph of similar size has done so already."""
+    """Compile the programs for a solve of this graph, unless a graph of the same padded size has done so."""
     structure = structure_of(graph)
     whole = padded(graph, structure)
     jax.block_until_ready(_point(whole, structure, whole.graph.poses, np.ones(len(structure.i))))
@@ -102,24 +103,27 @@ def _solve(
 
 _OPEN_POSE = "the edges leave a pose open: there is no covariance of it."
 _SINGULAR = 1e12
-"""Variance times own information above which a matrix is singular as far as numbers tell."""
+"""Product of a variance and its entry of the information above which a matrix is numerically singular."""
 
 
 def marginal_covariances(
     graph: PoseGraph, solution: Solution, vertices: Sequence[int], structure: Structure | None = None
 ) -> NDArray[np.float64]:
-    """Return covariances (k, d, d) of poses' right perturbations, rotation first; 0 of held vertices.
+    """Return the marginal covariances of some poses' right perturbations.
 
     They are blocks of the inverse of the Gauss-Newton Hessian J' Omega J at the solution, as in gtsam.
 
     Args:
-        graph: that was solved.
-        solution: of the graph.
-        vertices: whose covariances are asked for.
-        structure: of the graph, where it is known.
+        graph: the graph that was solved.
+        solution: solution of the graph.
+        vertices: the k vertices whose covariances are returned.
+        structure: structure of the graph, if it is known.
+
+    Returns:
+        (k, d, d) covariances, rotation (rad) before translation (m); zero for held vertices.
 
     Raises:
-        LioJaxError: the graph leaves a pose open.
+        LioJaxError: the edges do not determine all poses.
     """
     structure = structure or structure_of(graph)
     whole = padded(graph, structure)

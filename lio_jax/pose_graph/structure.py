@@ -1,4 +1,4 @@
-"""What a pose graph's edges connect: its parts, its unknowns, and the pairs of unknowns that are coupled."""
+"""The connections of a pose graph: its parts, its unknowns, and the pairs of unknowns that are coupled."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,34 +14,38 @@ from lio_jax.pose_graph.graph import POSITION, PRIOR, PoseGraph
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """The host's view of a graph's connections; it holds for any poses, measurements and weights."""
+    """A graph's connections on the host; they do not depend on poses, measurements and weights."""
 
     i: NDArray[np.int64]
+    """(e,) first vertex of each edge."""
     j: NDArray[np.int64]
+    """(e,) second vertex of each edge."""
     kind: NDArray[np.int64]
+    """(e,) kind of each edge."""
     used: NDArray[np.bool_]
-    """(e,) edges that count; the others, of weight 0, are not there."""
+    """(e,) True for edges that are used; the others have weight 0 and connect nothing."""
     part: NDArray[np.int64]
-    """(n,) which connected part of the graph each vertex is in, counted from 0."""
+    """(n,) number of the connected part of each vertex, from 0."""
     held: NDArray[np.bool_]
-    """(n,) vertices that keep their pose: the fixed ones, and the first of each part that nothing ties to the
-    world."""
+    """(n,) True for vertices that keep their pose: the fixed ones, and the first one of each part without a
+    fixed vertex, a prior or a position."""
     tangent_size: int
+    """Size of a tangent vector: 6 in space, 3 in the plane."""
 
     @property
     def parts(self) -> int:
-        """How many parts the graph falls into."""
+        """Return the number of connected parts of the graph."""
         return int(self.part.max(initial=-1)) + 1
 
     @cached_property
     def unknown(self) -> NDArray[np.int64]:
-        """(n,) number of each vertex among the unknowns; their count where it is held."""
+        """Return the (n,) number of each vertex among the unknowns; their count for held vertices."""
         numbers = np.cumsum(~self.held) - 1
         return np.where(self.held, self.count, numbers)
 
     @property
     def count(self) -> int:
-        """How many vertices are unknown."""
+        """Return the number of unknown vertices."""
         return int(np.sum(~self.held))
 
     @cached_property
@@ -56,36 +60,36 @@ class Structure:
 
     @property
     def pairs(self) -> NDArray[np.int64]:
-        """(m, 2) unknowns that an edge couples, the greater number first, none twice."""
+        """Return the (m, 2) pairs of unknowns that an edge couples, the greater number first, none twice."""
         return self._pairs[0]
 
     @property
     def pair_of(self) -> NDArray[np.int64]:
-        """(e,) the pair that each edge couples; m where it couples none."""
+        """Return the (e,) number of the pair that each edge couples; m where it couples none."""
         return self._pairs[1]
 
     @cached_property
     def order(self) -> Order:
-        """Order of elimination."""
+        """Return the order of elimination."""
         return order_of(self.count, self.pairs)
 
     @cached_property
     def plan(self) -> Plan:
-        """For matrices with one row per unknown tangent."""
+        """Return the plan for matrices with blocks of a tangent vector's size."""
         return plan_of(self.order, self.tangent_size)
 
     @cached_property
     def plan_of_coordinates(self) -> Plan:
-        """For matrices with 3 rows per unknown in space, 2 in the plane."""
+        """Return the plan for matrices with blocks of 3 rows in space, 2 in the plane."""
         return plan_of(self.order, 3 if self.tangent_size == 6 else 2)
 
 
 def structure_of(graph: PoseGraph, used: NDArray[np.bool_] | None = None) -> Structure:
-    """Return the structure of a graph; it may be kept while edges, kinds and fixed vertices stay the same.
+    """Return the structure of a graph; it is valid while edges, kinds and fixed vertices stay the same.
 
     Args:
-        graph: whose connections are asked for.
-        used: (e,) edges that count; None: all.
+        graph: vertices and edges.
+        used: (e,) True for edges that are used; None: all.
     """
     return structure_from(
         np.asarray(graph.i, np.int64),
@@ -105,7 +109,16 @@ def structure_from(
     tangent_size: int,
     used: NDArray[np.bool_] | None = None,
 ) -> Structure:
-    """Return the structure of a graph whose fields these are."""
+    """Return the structure of a graph from its fields.
+
+    Args:
+        i: (e,) first vertex of each edge.
+        j: (e,) second vertex of each edge.
+        kind: (e,) kind of each edge.
+        fixed: (n,) True for vertices that keep their pose.
+        tangent_size: 6 in space, 3 in the plane.
+        used: (e,) True for edges that are used; None: all.
+    """
     used = np.ones(len(i), bool) if used is None else used
     part = parts_of(len(fixed), i[used], j[used])
     tied = np.zeros(part.max(initial=-1) + 1, bool)
@@ -118,7 +131,7 @@ def structure_from(
 
 
 def parts_of(count: int, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return which connected part each vertex belongs to; parts are counted by their first vertex."""
+    """Return the (count,) number of each vertex's connected part; parts are ordered by their first vertex."""
     ones = np.ones(len(i), np.int8)
     _, label = connected_components(sparse.coo_matrix((ones, (i, j)), (count, count)), directed=False)
     _, first, part = np.unique(label, return_index=True, return_inverse=True)

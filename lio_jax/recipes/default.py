@@ -28,7 +28,7 @@ class Default(Recipe[Config, Params, State]):
     }
 
     def init(self, params: Params, imu: ImuBatch | None = None) -> State:
-        """Return the state before the first scan; its form says whether there are inertial samples."""
+        """Return the state before the first scan; its form depends on whether there are inertial samples."""
         if imu is None:
             return lidar_odometry.init(self.config, params)
         return lidar_inertial.init(self.config, params, imu)

@@ -145,16 +145,16 @@ class State(recipe.State):
     """What is carried from scan to scan."""
 
     nav: NavState
-    """At the last scan's end."""
+    """State at the last scan's end."""
     uncertain: NavEstimate
     """What the filter estimates: the navigation state at the last scan's end, and its covariance. Without
     inertial samples that at the scan's middle, where an error of the velocity distorts the scan least."""
     rate: Float[Array, "3"]
     """Mean angular rate between the last two of those instants, rad/s, IMU frame."""
     to_end: Float[Array, ""]
-    """From that instant to the scan's end, s."""
+    """Time from that instant to the scan's end, s."""
     scans: Int32[Array, ""]
-    """Scans with points seen so far."""
+    """Number of scans with points so far."""
     map: PointMap
 
     def with_velocity_of(self, found: "State") -> "State":

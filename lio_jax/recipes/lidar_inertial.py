@@ -40,14 +40,14 @@ class State(recipe.State):
     """What is carried from scan to scan."""
 
     nav: NavState
-    """At the last scan's end."""
+    """State at the last scan's end."""
     covariance: Float[Array, "24 24"]
-    """Of its error within the map."""
+    """Covariance of the state's error within the map."""
     drift: MapDrift
     prediction_error: Float[Array, ""]
-    """Expected error of the next prediction, m: it opens the robust kernel."""
+    """Expected error of the next prediction, m; the robust kernel is wide enough for it."""
     scans: Int32[Array, ""]
-    """Scans with points seen so far."""
+    """Number of scans with points so far."""
     map: VoxelMap
 
     @property

@@ -24,17 +24,17 @@ class State(recipe.State):
     """What is carried from scan to scan."""
 
     nav: NavState
-    """At the last scan's end."""
+    """State at the last scan's end."""
     T_world_lidar: jaxlie.SE3
-    """At the middle of the last scan: the instant registration solves for, where deskewing errs least."""
+    """Pose at the middle of the last scan, which registration finds: deskewing has the least error there."""
     mid_to_end: Float[Array, ""]
-    """From that instant to the scan's end, s."""
+    """Time from the scan's middle to its end, s."""
     twist: Float[Array, "6"]
     """Velocity of the lidar in its own frame, m/s then rad/s."""
     prediction_error: Float[Array, ""]
     """Expected error of the next prediction, m."""
     scans: Int32[Array, ""]
-    """Scans with points seen so far."""
+    """Number of scans with points so far."""
     map: VoxelMap
 
     def with_velocity_of(self, found: "State") -> "State":

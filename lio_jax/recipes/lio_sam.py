@@ -58,15 +58,15 @@ class State(recipe.State):
     """What is carried from scan to scan."""
 
     nav: NavState
-    """At the last scan's end: the matched pose, velocity and biases of the smoother."""
+    """State at the last scan's end: the matched pose, and the smoother's velocity and biases."""
     window: Window
     """The smoother's states, the latest at the last scan's end."""
     time: Float[Array, ""]
-    """Since the first scan's end, s."""
+    """Time of the last scan's end since the first scan's end, s."""
     matched_at: Float[Array, ""]
-    """The same of the last scan that was matched."""
+    """Time of the end of the last matched scan since the first scan's end, s."""
     scans: Int32[Array, ""]
-    """Scans with points seen so far."""
+    """Number of scans with points so far."""
     map: Submap
 
     def with_velocity_of(self, found: "State") -> "State":

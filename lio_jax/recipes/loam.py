@@ -117,17 +117,17 @@ class State(recipe.State):
     """What is carried from scan to scan."""
 
     nav: NavState
-    """At the last scan's end, corrected by the map."""
+    """State at the last scan's end, corrected by the map."""
     T_odom_lidar: jaxlie.SE3
-    """Of the scan to match the next one with, at its middle: the instant at which deskewing errs least."""
+    """Pose of the scan to match the next one with, at its middle, where deskewing has the least error."""
     T_map_odom: jaxlie.SE3
     """Correction that the last match with the map found."""
     since: Float[Array, ""]
-    """From that middle to the last scan's end, s."""
+    """Time from that middle to the last scan's end, s."""
     twist: Float[Array, "6"]
     """Velocity of the lidar in its own frame, m/s then rad/s."""
     scans: Int32[Array, ""]
-    """Scans with points seen so far."""
+    """Number of scans with points so far."""
     map: Targets
 
     def with_velocity_of(self, found: "State") -> "State":
@@ -265,7 +265,7 @@ class _Motion(eqx.Module):
     elapsed: Float[Array, ""]
     known: Bool[Array, ""]
     middle: Float[Array, ""]
-    """Of the scan, s from its start."""
+    """Time of the scan's middle, s from its start."""
 
     def twist_to(self, T_last_lidar: jaxlie.SE3) -> Float[Array, "6"]:
         """Return the constant twist that leads to a pose; the last one where there was no scan before."""

@@ -1,4 +1,4 @@
-"""What every recipe's step reports beside its state."""
+"""The output of every recipe's step, in addition to its state."""
 
 import equinox as eqx
 from jaxtyping import Array, Bool, Float, Int32
@@ -9,51 +9,53 @@ from lio_jax.registration.point_evidence import PointEvidence
 
 
 class Evidence(eqx.Module):
-    """How well a scan was foretold by the prediction and the map."""
+    """Statistics of how well the prediction and the map agree with a scan."""
 
     innovation: Innovation
-    """Of the scan match as one measurement of the pose."""
+    """Innovation of the scan match, taken as one measurement of the pose."""
     information: Float[Array, "6 6"]
-    """Of that measurement: the share of the points' information that the filter believed."""
+    """Information of that measurement: the share of the points' information that the filter used."""
     gradient: Float[Array, "6"]
-    """Of the measurement's half squared error at the solution."""
+    """Gradient of half of the measurement's squared error at the solution."""
     pose_covariance: Float[Array, "6 6"]
-    """Of the predicted lidar pose, in the same perturbation."""
+    """Covariance of the predicted lidar pose, for the same perturbation."""
     points: PointEvidence | None = None
-    """None from recipes whose map keeps no distributions."""
+    """Statistics of the points' distances; None from recipes whose map has no distributions."""
 
 
 class Output(eqx.Module):
-    """Of one scan."""
+    """The output of a step for one scan."""
 
     registration: Registration
+    """Result of the scan match."""
     lost: Bool[Array, ""]
-    """The scan could not be matched; the pose is the prediction and the map was left alone."""
+    """True if the scan could not be matched; the pose is then the prediction, and the map did not change."""
     nis: Float[Array, ""]
-    """Normalised innovation squared of the match against the prediction; 0 where there was none."""
+    """Normalised innovation squared of the match; 0 without a match."""
     nis_dof: Int32[Array, ""]
-    """Its degrees of freedom: the directions the match observed."""
+    """Degrees of freedom of ``nis``: the number of directions that the match observed."""
     points: Float[Array, "m 3"]
     """The thinned scan, motion compensated, in world axes from ``origin``, m."""
     points_mask: Bool[Array, " m"]
+    """True where a row of ``points`` is real."""
     added: Bool[Array, " m"]
-    """Which of ``points`` were new to the map."""
+    """True for ``points`` that were new to the map."""
     origin: Float[Array, "3"]
-    """Where ``points`` count from, m in world."""
+    """Origin of ``points``, m, in world."""
     thinned_away: Int32[Array, ""]
-    """Occupied cells of the scan beyond its capacities: they thin the scan further, evenly."""
+    """Number of occupied cells of the scan beyond the capacities; their loss thins the scan evenly."""
     map_dropped: Int32[Array, ""]
-    """Points whose voxel found no room in the map."""
+    """Number of points whose voxel found no room in the map."""
     corners: Bool[Array, " m"] | None = None
-    """Which of ``points`` are corners, the others being surfaces; None from recipes without features."""
+    """True for ``points`` that are corners, False for surface points; None from recipes without features."""
     covariance: Float[Array, "24 24"] | None = None
-    """Of the navigation state's error in the world; None from recipes that carry none."""
+    """Covariance of the navigation state's error in the world; None from recipes without a covariance."""
     evidence: Evidence | None = None
-    """None from recipes that carry no covariance."""
+    """Statistics of the match; None from recipes without a covariance."""
     log_evidence: Float[Array, ""] | None = None
-    """Log marginal likelihood of all measurements since the smoother began; None from recipes without one."""
+    """Log marginal likelihood of all measurements since the smoother's start; None without a smoother."""
     restarted: Bool[Array, ""] | None = None
-    """The smoother ran away and began anew; None from recipes without one."""
+    """True if the smoother diverged and was started again; None from recipes without a smoother."""
     smoother_unfinished: Bool[Array, ""] | None = None
     """The match converged, and the smoother reached its largest number of linearisations; None from recipes
     without one."""

@@ -16,9 +16,9 @@ class State(eqx.Module):
     """What a recipe carries from scan to scan: a pytree with a navigation state and a map."""
 
     nav: eqx.AbstractVar[NavState]
-    """At the last scan's end."""
+    """State at the last scan's end."""
     map: eqx.AbstractVar[Any]
-    """What scans are matched with: a pytree, a constant of the derivative."""
+    """The map that scans are matched with: a pytree, which the derivative takes as constant."""
 
     @abstractmethod
     def with_velocity_of(self, found: Any) -> Any:
@@ -31,14 +31,14 @@ class State(eqx.Module):
 
 @dataclass(frozen=True)
 class Needs:
-    """What a recipe asks of a recording."""
+    """What a recipe needs from a recording."""
 
     imu: Literal["required", "used", "unused"] = "used"
     """required: the recipe refuses to run without inertial samples; used: it runs without, less well."""
     rings: bool = False
-    """Features are found along the sensor's rings."""
+    """True if the recipe finds features along the sensor's rings."""
     point_times: bool = True
-    """The motion within a sweep is compensated where the points have times."""
+    """True if the recipe compensates the motion within a sweep whose points have times."""
 
 
 C = TypeVar("C", bound=RecipeConfig)

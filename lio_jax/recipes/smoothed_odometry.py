@@ -63,7 +63,7 @@ def match_as_measurement(
     arm_squared: Float[Array, ""],
     there: Bool[Array, ""],
 ) -> PoseMeasurement:
-    """Return what a scan match says of the IMU's pose.
+    """Return the measurement of the IMU's pose by a scan match.
 
     Args:
         config: ``config.lio_sam.lidar_noise``.
@@ -75,7 +75,7 @@ def match_as_measurement(
     """
     if config.lio_sam.lidar_noise == "information":
         by_imu = adjoint(params.extrinsics.T_imu_lidar().inverse())
-        # along a degenerate direction the pose is the prediction, of which the samples tell already
+        # along a degenerate direction the pose is the prediction, which the samples measure already
         ratio = jnp.where(jnp.any(match.degenerate), params.registration.degeneracy_ratio, 0.0)
         observed, _, _ = keep_observed(
             match.information, jnp.zeros(POSE_DOF, arm_squared.dtype), arm_squared, ratio

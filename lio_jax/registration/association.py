@@ -20,6 +20,7 @@ class Association(eqx.Module, Generic[_Found]):
 
     found: _Found
     T_world_lidar: jaxlie.SE3
+    """Pose of the lidar at which the association was found, m."""
     arm: Float[Array, ""]
     """Root mean square distance of the points from the sensor, m: what a turn moves them by."""
 

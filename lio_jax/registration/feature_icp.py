@@ -107,7 +107,7 @@ class _End(eqx.Module):
     done: Bool[Array, ""]
     association: Association[LinesAndPlanes]
     directions: Directions
-    """Of the last step."""
+    """Principal directions of the last step."""
 
 
 def _solve(max_iterations: int, rounds: Int32[Array, ""], task: ScanRegistration) -> Solution:
@@ -154,7 +154,7 @@ def _solve(max_iterations: int, rounds: Int32[Array, ""], task: ScanRegistration
 
 
 def _again(step: Float[Array, "6"], end: _End, task: ScanRegistration) -> NormalEquations:
-    """Linearise once more at a pose beside the solution, with the matches found."""
+    """Linearise once more at a pose near the solution, with its matches."""
     return task.linearised(moved(end.T_target_lidar, step), end.association.found)
 
 

@@ -20,6 +20,7 @@ class Registration(eqx.Module):
     """Result of a scan-to-map solve."""
 
     T_world_lidar: jaxlie.SE3
+    """Estimated pose of the lidar, m."""
     information: Float[Array, "6 6"]
     """Inverse covariance of the right perturbation, rotation (rad) before translation (m)."""
     degenerate: Bool[Array, " 6"]
@@ -29,6 +30,7 @@ class Registration(eqx.Module):
     rmse: Float[Array, ""]
     """Robustly weighted root mean square distance to the map, m."""
     iterations: Int32[Array, ""]
+    """Number of Gauss-Newton steps."""
     status: Int32[Array, ""]
     """CONVERGED, ITERATION_LIMIT or TOO_FEW_MATCHES; in the last case the pose is the prediction."""
 
@@ -37,8 +39,11 @@ class NormalEquations(eqx.Module):
     """The solve linearised at one pose, in world axes at the sensor's position."""
 
     hessian: Float[Array, "6 6"]
+    """Gauss-Newton Hessian of half the weighted squared error."""
     gradient: Float[Array, "6"]
+    """Gradient of half the weighted squared error."""
     matches: Int32[Array, ""]
+    """Number of matched points."""
     weight: Float[Array, ""]
     """Sum of the robust weights."""
     squared_error: Float[Array, ""]
@@ -60,12 +65,12 @@ class NormalEquations(eqx.Module):
 
 
 class Directions(eqx.Module):
-    """Along which a step was taken."""
+    """The principal directions of a step."""
 
     vectors: Float[Array, "6 6"]
-    """In columns, scaled to metres."""
+    """Principal directions in columns, scaled to metres."""
     degenerate: Bool[Array, " 6"]
-    """Which of them the scan does not constrain: they were held."""
+    """True for directions that the scan does not constrain; the pose keeps the prediction along them."""
 
     @staticmethod
     def none(dtype: jnp.dtype) -> "Directions":
@@ -112,7 +117,7 @@ def unmet(
     """Return what vanishes at a solution: the gradient where observed, else the way from the prediction.
 
     Args:
-        T_world_lidar: a pose at the solution or beside it.
+        T_world_lidar: a pose at the solution or near it.
         T_predicted: what the solve began at.
         directions: of its last step.
         gradient: at ``T_world_lidar``.

@@ -21,9 +21,11 @@ class Planes(eqx.Module):
     """The plane that each point lies on, in world axes from the frame's origin."""
 
     normal: Float32[Array, "k 3"]
+    """Unit normal of each plane."""
     offset: Float32[Array, " k"]
     """The plane is where normal'p + offset = 0, m."""
     valid: Bool[Array, " k"]
+    """True where a point has a plane."""
 
 
 def no_planes(mask: Bool[Array, " k"]) -> Planes:
@@ -104,7 +106,7 @@ def fit_planes(x: _Coordinates, y: _Coordinates, z: _Coordinates) -> tuple[Plane
     has none for planes through it; distances know no origin.
 
     Args:
-        x: m; y and z likewise.
+        x: m, as are y and z.
 
     Returns:
         The planes, all called valid, and the largest distance of each plane's own points from it, m.
@@ -122,7 +124,7 @@ def spread(
     """Return each column's centre, its points from there, and their second moments.
 
     Args:
-        x: m; y and z likewise.
+        x: m, as are y and z.
 
     Returns:
         The moments divided by the number of points, xx, yy, zz, xy, xz and yz, m^2.

@@ -28,23 +28,31 @@ class Lines(eqx.Module):
     """The line that each point lies on, as two planes; both have the same ``valid``."""
 
     first: Planes
+    """First plane through each line."""
     second: Planes
+    """Second plane through each line, normal to the first."""
 
 
 class FeaturePoints(eqx.Module):
     """Corners and surface points of a scan, m, lidar frame of one instant."""
 
     corner: Float[Array, "c 3"]
+    """Corners, m."""
     corner_mask: Bool[Array, " c"]
+    """True where a corner is real."""
     surface: Float[Array, "s 3"]
+    """Surface points, m."""
     surface_mask: Bool[Array, " s"]
+    """True where a surface point is real."""
 
 
 class Frames(eqx.Module):
-    """Of the lines and of the planes: they may come from maps with different grids."""
+    """The frames of the lines and of the planes, which may come from maps with different grids."""
 
     corner: Frame
+    """Frame of the lines."""
     surface: Frame
+    """Frame of the planes."""
 
 
 class LinesAndPlanes(eqx.Module):
@@ -87,7 +95,7 @@ def fit_lines(
     It passes through the points' centre along the eigenvector of their largest variance.
 
     Args:
-        x: m; y and z likewise.
+        x: m, as are y and z.
 
     Returns:
         The lines, all called valid, their directions, and the columns' variances in ascending order, m^2.
@@ -129,15 +137,16 @@ def lines_near(
 
 
 Weight = Callable[[Float[Array, " k"], Float[Array, " k"]], Float[Array, " k"]]
-"""Of a residual, by its squared distance and the point's squared range, m^2."""
+"""Weight of a residual as a function of its squared distance (m^2) and the point's squared range (m^2)."""
 
 
 class Weights(NamedTuple):
     """Robust weights of either kind's distances."""
 
     corner: Weight
-    """A line's two distances share one."""
+    """Weight of a line; both of its distances have the same."""
     surface: Weight
+    """Weight of a plane's distance."""
 
 
 def huber(kernel: Float[Array, ""]) -> Weights:
@@ -219,7 +228,7 @@ class _Rows(eqx.Module):
     """Distances of points from planes, and their derivatives."""
 
     columns: Float[Array, "7 k"]
-    """By a turn about the sensor and by a move, in world axes; then the distance, m. Zero without a match."""
+    """Derivatives of the distance by rotation and translation, in world axes; then the distance, m."""
     distance: Float[Array, " k"]
     range_squared: Float[Array, " k"]
 

@@ -1,4 +1,4 @@
-"""What matched points tell of the noise: how far they lie from the map."""
+"""Statistics of matched points' distances from the map, which show the noise."""
 
 import equinox as eqx
 import jax
@@ -22,11 +22,11 @@ class PointEvidence(eqx.Module):
     """Sums over the matched points at the solution, robustly weighted."""
 
     squared_error: Float[Array, ""]
-    """Of the distances in units of their noise."""
+    """Weighted sum of the squared distances in units of their noise."""
     log_det: Float[Array, ""]
-    """Of the logarithms of the noise's variances, m^2."""
+    """Weighted sum of the logarithms of the noise's variances (m^2)."""
     scale: Float[Array, ""]
-    """How many points each counts as, ``registration.information_scale``."""
+    """Factor of each point's information, ``registration.information_scale``."""
 
 
 def point_evidence(
@@ -36,13 +36,13 @@ def point_evidence(
     frame: Frame,
     params: Params,
 ) -> PointEvidence:
-    """Return what the matched points tell at a pose, weighted as they were in the solve.
+    """Return the statistics of the matched points at a pose, with the weights of the solve.
 
     Args:
-        matches: of the points.
+        matches: matches of the points.
         points: m, lidar frame.
         T_world_lidar: the solution.
-        frame: of the matches.
+        frame: frame of the matches.
         params: traced.
     """
     kind, dtype = points.dtype, T_world_lidar.wxyz_xyz.dtype

@@ -20,18 +20,18 @@ from lio_jax.core.xla import computed_once
 from lio_jax.lidar.range_image import azimuth
 
 _SIDE, _NARROW = 8, 24
-"""Rings above and below a query's own, and points of each, that are looked at for the nearest point."""
+"""Number of rings above and below a query's own, and of points in each, that are searched first."""
 _BESIDE, _WIDE = 2, 32
-"""Likewise for the next ones, around the nearest one's ring."""
+"""Number of rings around the nearest point's own, and of points in each, that are searched for the others."""
 _CHUNK, _FARTHER_NARROW, _FARTHER_WIDE = 32, 32, 256
-"""Queries that look farther at a time, and the points of each ring that they look at."""
+"""Number of queries of a farther search at a time, and of points that it searches in each ring."""
 _LAST_CHUNK = 8
-"""Queries that look at all points at a time."""
+"""Number of queries of a search of all points at a time."""
 _SECTORS = 512
 """Parts of a ring that it is sorted into: few, so that a number of 32 bits holds ring, sector and row."""
 _QUARTER = np.float32(np.pi / 2)
 _ROUNDING = np.float32(1e-5)
-"""What an azimuth is rounded by at most, rad."""
+"""Largest rounding error of an azimuth, rad."""
 _TURN = np.float32(2 * np.pi)
 
 _Points = tuple[Float32[Array, " k"], Float32[Array, " k"], Float32[Array, " k"]]
@@ -41,13 +41,15 @@ class RingIndex(eqx.Module):
     """Clouds sorted for the search; masked points come last."""
 
     x: Float32[Array, " m"]
-    """m."""
+    """Coordinate x of each point, m."""
     y: Float32[Array, " m"]
+    """Coordinate y of each point, m."""
     z: Float32[Array, " m"]
+    """Coordinate z of each point, m."""
     ring: Int32[Array, " m"]
-    """-1 where there is no point."""
+    """Ring of each point; -1 where there is no point."""
     azimuth: Float32[Array, " m"]
-    """rad."""
+    """Azimuth of each point, rad."""
     first: Int32[Array, " cells"]
     """Place of the first point in or after each sector of each ring, ring after ring, and the end."""
     elevation: Float32[Array, " rings"]
@@ -67,9 +69,11 @@ class Queries(eqx.Module):
     """Points whose neighbours are sought."""
 
     x: Float32[Array, " k"]
-    """m, in the index's frame."""
+    """Coordinate x of each query, m, in the index's frame."""
     y: Float32[Array, " k"]
+    """Coordinate y of each query, m, in the index's frame."""
     z: Float32[Array, " k"]
+    """Coordinate z of each query, m, in the index's frame."""
     lowest: Int32[Array, " k"]
     """First ring of the cloud to search."""
 
@@ -83,10 +87,11 @@ class Nearest(eqx.Module):
     """Places of points in an index, -1 where there is none within the radius."""
 
     nearest: Int32[Array, " k"]
+    """Place of the nearest point."""
     same_ring: Int32[Array, " k"]
-    """The next one of the nearest one's ring."""
+    """Place of the next nearest point in the ring of the nearest one."""
     other_ring: Int32[Array, " k"]
-    """The nearest one of the rings beside it."""
+    """Place of the nearest point in the neighbouring rings."""
 
 
 def ring_index(
@@ -166,7 +171,7 @@ def _again(
     search: Callable[[_Given], tuple[_Found, Bool[Array, " c"]]],
     chunk: int = _CHUNK,
 ) -> tuple[_Found, Bool[Array, " k"]]:
-    """Search anew for some of the queries, chunk by chunk; tell for which ones the result is sure then."""
+    """Search again for some of the queries, chunk by chunk; return for which ones the result is exact."""
     count = len(unsure)
     rank = running_count(unsure) - 1
     order = jnp.arange(count, dtype=jnp.int32)
@@ -237,7 +242,7 @@ class _Search(eqx.Module):
     def beside_of_all(
         self, given: tuple[Queries, Int32[Array, " k"]]
     ) -> tuple[tuple[Array, Array], Bool[Array, " k"]]:
-        """Return what ``beside`` does."""
+        """Return the result of ``beside``, from a search of all points."""
         queries, nearest = given
         ring = self.index.ring[:, None]
         squared = self._squared(queries)
@@ -271,7 +276,7 @@ class _Windows(eqx.Module):
     size: Int32[Array, "b k"]
     """The ring's points; 0 beyond the cloud's rings."""
     elevation: Float32[Array, "b k"]
-    """Of the ring, rad."""
+    """Elevation of the ring, rad."""
     begin: Int32[Array, "b k"]
     """From ``start`` to the window's first point; negative where the window begins at the ring's end."""
     length: int = eqx.field(static=True)

@@ -47,9 +47,9 @@ def last_scan(
 
     Args:
         corner: less sharp points, for their rings and mask.
-        surface: less flat points, likewise.
+        surface: less flat points, for their rings and mask.
         corner_points: of ``corner``, in the frame of the instant, m.
-        surface_points: of ``surface``, likewise.
+        surface_points: of ``surface``, in the frame of the instant, m.
         rings: number of the sensor's rings.
     """
     points = jnp.concatenate([corner_points, surface_points])

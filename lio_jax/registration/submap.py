@@ -22,7 +22,9 @@ class Submap(eqx.Module):
     """Keyframes, and the points of those around the vehicle."""
 
     keyframes: Keyframes
+    """Keyframes with their clouds."""
     features: FeatureMap
+    """Map of the points of the keyframes around the vehicle."""
 
 
 class ScanToSubmap(feature_map.ScanToMap):

@@ -34,7 +34,7 @@ class Frame(eqx.Module):
     anchor: Int32[Array, "3"]
     """The voxel whose lower corner is the origin."""
     origin: Float[Array, "3"]
-    """That corner, m in world."""
+    """Position of that corner, m, in world."""
 
     def place(
         self, points: Float[Array, "k 3"], T_world_lidar: jaxlie.SE3
@@ -58,11 +58,13 @@ class Matches(eqx.Module):
     mean: Float32[Array, "k 3"]
     """m."""
     normal: Float32[Array, "k 3"]
+    """Unit normal of each voxel's plane."""
     variances: Float32[Array, "k 2"]
     """The voxel's two smaller variances, ascending, m^2."""
     count: Float32[Array, " k"]
-    """Points of the voxel."""
+    """Number of points of the voxel."""
     used: Bool[Array, " k"]
+    """True where a point has a match."""
 
 
 def associate(
@@ -95,15 +97,15 @@ class PointNoise(eqx.Module):
     """Each matched point's distance from its plane and the noise of that distance."""
 
     arm: Float[Array, "k 3"]
-    """From the sensor, in world axes, m."""
+    """Vector from the sensor to each point, in world axes, m."""
     distance: Float[Array, " k"]
-    """Along the plane's normal, m; zero where there is no match."""
+    """Distance from the plane along its normal, m; zero where there is no match."""
     variance: Float[Array, " k"]
-    """Of the distance, m^2; one where there is no match."""
+    """Variance of the distance, m^2; one where there is no match."""
     precision: Float[Array, " k"]
-    """What the distance is believed with, 1/m^2; zero where there is no match."""
+    """Precision with which the distance is weighted, 1/m^2; zero where there is no match."""
     scaled_squared: Float[Array, " k"]
-    """Of the distance, scaled by its noise: the square itself on a flat voxel, m^2."""
+    """Squared distance, scaled by its noise, m^2; in a flat voxel it is the squared distance itself."""
 
     def weight(self, kernel: Float[Array, ""]) -> Float[Array, " k"]:
         """Return the Geman-McClure weights of the noise-scaled distances, zero where there is no match."""
@@ -301,7 +303,7 @@ class _End(eqx.Module):
     done: Bool[Array, ""]
     association: Association[Matches]
     directions: Directions
-    """Of the last step."""
+    """Principal directions of the last step."""
 
 
 def _solve(max_iterations: int, task: _Task) -> Solution:
@@ -338,7 +340,7 @@ def _solve(max_iterations: int, task: _Task) -> Solution:
 
 
 def _again(step: Float[Array, "6"], end: _End, task: _Task) -> NormalEquations:
-    """Linearise once more at a pose beside the solution, with the associations found."""
+    """Linearise once more at a pose near the solution, with its associations."""
     T = moved(end.T_world_lidar, step)
     return task.linearised(T, task.points_at(T), end.association.found, end.iterations - 1)
 

@@ -95,7 +95,7 @@ def test_a_failure_leaves_nothing(tmp_path, recorded, name, error) -> None:
 
 @pytest.mark.parametrize("size", [6_000, 60_000])
 @pytest.mark.parametrize("name", FORMATS)
-def test_a_full_disk_is_said_in_one_sentence_and_leaves_nothing(tmp_path, recorded, name, size) -> None:
+def test_a_full_disk_is_reported_in_one_sentence_and_leaves_no_file(tmp_path, recorded, name, size) -> None:
     write(tmp_path / name, recorded, overwrite=True)
     before = sorted(path.name for path in tmp_path.rglob("*"))
     with full_disk_after(size), pytest.raises(LioJaxError) as caught:

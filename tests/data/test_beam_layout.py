@@ -39,7 +39,7 @@ def test_no_points_have_no_levels_and_say_nothing():
 
 
 @pytest.mark.parametrize(("layout", "beams"), [("VLP-16", 16), ("HDL-32E", 32), ("HDL-64E", 64)])
-def test_the_right_number_of_beams_says_nothing(layout, beams):
+def test_the_right_number_of_beams_gives_no_message(layout, beams):
     assert check_beams(scan(layout), beams, True, "bag") == ()
     # the highest beams see only sky
     seen = scan(layout)

@@ -23,7 +23,7 @@ def test_fixes_are_local_to_the_first_valid_one() -> None:
     assert notes == ("GPS: 3 messages without a valid fix were left out",)
 
 
-def test_an_unstated_covariance_is_assumed_and_said() -> None:
+def test_a_missing_covariance_is_assumed_and_reported() -> None:
     collector = GpsCollector()
     collector.add(bags.fix_message(4, 49.0, 8.0, variance=0.0))
     gps, notes = collector.gps()

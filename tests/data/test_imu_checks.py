@@ -105,7 +105,7 @@ def test_a_recording_played_twice_keeps_the_first_pass():
     np.testing.assert_array_equal(result.gyro[:-1], imu.gyro[: len(result.gyro) - 1])
 
 
-def test_the_longest_ascent_is_found_whatever_the_order():
+def test_the_longest_ascent_is_found_in_any_order():
     rng = np.random.default_rng(3)
     for _ in range(20):
         stamps = rng.integers(0, 30, 30)
@@ -173,7 +173,7 @@ def test_fast_handheld_rotation_is_not_suspected():
     assert cleaned(imu, "x")[1] == ()
 
 
-def test_specific_force_that_points_down_is_said():
+def test_specific_force_that_points_down_is_reported():
     imu = drive()
     _, said = cleaned(replaced(imu, accel=-imu.accel), "imu.npz")
     (sentence,) = said
@@ -208,7 +208,7 @@ def test_saturation_is_named(column, limit, name):
     assert f"the {name}'s y axis stays at -{limit:g} and {limit:g}" in said[0]
 
 
-def test_no_sample_left_is_said():
+def test_a_recording_without_valid_samples_is_reported():
     imu = drive(1.0)
     result, said = cleaned(replaced(imu, gyro=np.full((200, 3), np.nan)), "imu.npz")
     assert len(result.stamp_ns) == 0

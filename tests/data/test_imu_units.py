@@ -16,7 +16,7 @@ def _driving(gravity: float) -> np.ndarray:
     return np.array([0.0, 0.0, gravity]) + rng.normal(0.0, 0.1 * gravity, (500, 3))
 
 
-def test_g_is_recognised_and_said() -> None:
+def test_the_unit_g_is_recognised_and_reported() -> None:
     scale, note = accel_scale(_driving(1.0), CONFIG)
     assert scale == 9.80665
     assert note == "accelerometer in g (median 0.997): converted to m/s^2"

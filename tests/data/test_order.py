@@ -100,7 +100,7 @@ def test_a_duplicate_of_a_wild_stamp() -> None:
     assert "wrong stamp" in warnings[1]
 
 
-def test_what_is_kept_ascends_whatever_comes() -> None:
+def test_kept_stamps_ascend_for_any_input() -> None:
     for times in permutations([0, 1, 2, 30, 31, 9e9]):
         chosen, warnings = kept(*times)
         assert chosen == sorted(set(chosen))

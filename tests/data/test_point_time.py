@@ -172,7 +172,7 @@ def test_receipt_sooner_than_the_scan_lasts_says_that_the_stamp_is_at_the_end() 
 
 
 @pytest.mark.parametrize("latency", [0, -3_000_000_000, 40_000_000_000_000])
-def test_receipt_of_another_clock_tells_nothing_and_start_is_assumed(latency: int) -> None:
+def test_receipt_times_of_another_clock_are_not_used_and_start_is_assumed(latency: int) -> None:
     samples, times = _samples(
         lambda start: start,
         "s",

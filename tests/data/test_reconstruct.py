@@ -105,12 +105,12 @@ def test_no_points_and_no_duration_give_no_time() -> None:
     assert not azimuth_time(points_at(np.linspace(0, 3, 9)), 0.0).any()
 
 
-def test_sixteen_beams_are_told_by_their_elevation() -> None:
+def test_sixteen_beams_are_recognised_by_their_elevation() -> None:
     elevation = np.arange(-15.0, 15.1, 2.0)
     np.testing.assert_array_equal(ring_from_elevation(points_at(np.zeros(16), elevation), 16), np.arange(16))
 
 
-def test_thirty_two_beams_are_told_by_their_elevation() -> None:
+def test_thirty_two_beams_are_recognised_by_their_elevation() -> None:
     elevation = -92.0 / 3.0 + np.arange(32) * 4.0 / 3.0 + 0.05
     np.testing.assert_array_equal(ring_from_elevation(points_at(np.zeros(32), elevation), 32), np.arange(32))
 
@@ -130,7 +130,7 @@ def test_thirty_two_beams_are_told_by_their_elevation() -> None:
         (2.1, -1),
     ],
 )
-def test_sixty_four_beams_are_told_by_loams_two_blocks(elevation: float, ring: int) -> None:
+def test_sixty_four_beams_are_recognised_by_loams_two_blocks(elevation: float, ring: int) -> None:
     point = points_at(np.zeros(1), np.array([elevation]))
     a = elevation
     expected = int((2 - a) * 3 + 0.5) if a >= -8.83 else 32 + int((-8.83 - a) * 2 + 0.5)

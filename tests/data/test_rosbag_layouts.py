@@ -115,7 +115,7 @@ def test_the_real_ouster_recording() -> None:
     assert sequence.warnings_so_far == ()
 
 
-def test_missing_ring_and_time_are_reconstructed_and_said(tmp_path: Path) -> None:
+def test_missing_ring_and_time_are_reconstructed_and_reported(tmp_path: Path) -> None:
     order = np.argsort(SEEN.time, kind="stable")
     cloud = bags.fill(bags.PLAIN, SEEN)[order]
     path = bags.write_bag(tmp_path / "a.bag", cloud_messages(tmp_path / "a.bag", [cloud] * 3))

@@ -38,7 +38,7 @@ def test_imu_and_gps_come_in_one_pass(tmp_path: Path, name: str, monkeypatch: py
     assert any("accelerometer in g" in note for note in sequence.info.notes)
 
 
-def test_of_two_lidars_the_busier_is_taken_and_said(tmp_path: Path) -> None:
+def test_of_two_lidars_the_busier_is_taken_and_reported(tmp_path: Path) -> None:
     few = bags.velodyne_messages(2, ros2=False, topic="/rear/points")
     path = bags.write_bag(
         tmp_path / "a.bag", in_order(few + bags.velodyne_messages(3, ros2=False, topic="/front/points"))

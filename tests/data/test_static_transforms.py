@@ -72,7 +72,7 @@ def test_what_is_no_rigid_motion_is_left_out(tmp_path, wrong):
     assert any("does not tie" in note for note in sequence.info.notes)
 
 
-def test_without_static_transforms_nothing_is_said(tmp_path):
+def test_without_static_transforms_nothing_is_reported(tmp_path):
     sequence = opened(tmp_path, "a.bag", None)
     assert sequence.info.T_imu_lidar is None
     assert not any("T_imu_lidar" in note for note in sequence.info.notes)

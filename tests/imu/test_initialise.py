@@ -140,7 +140,7 @@ def test_the_covariance_is_that_of_the_errors(initialise):
     assert low < total / runs < high
 
 
-def test_tilt_and_bias_across_gravity_are_told_apart_by_nobody(initialise):
+def test_tilt_and_bias_normal_to_gravity_are_not_observable_apart(initialise):
     start = initialise(resting(np.random.default_rng(3), np.eye(3), np.zeros(3), np.zeros(3))).start
     covariance = np.asarray(start.covariance)
     sigma = np.sqrt(np.diagonal(covariance))

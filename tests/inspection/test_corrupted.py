@@ -114,7 +114,7 @@ def test_a_healthy_recording_gives_no_suspicion(tmp_path):
 
 
 @pytest.mark.parametrize("name", CORRUPTED)
-def test_what_was_done_to_a_recording_is_told(name, tmp_path):
+def test_every_corruption_of_a_recording_is_reported(name, tmp_path):
     change, sentence = CORRUPTED[name]
     problems = inspected(tmp_path, change(walk())).problems
     assert any(sentence in problem for problem in problems), problems

@@ -209,7 +209,7 @@ def test_a_scan_without_points_has_no_features(features):
 
 
 @pytest.mark.parametrize("features", [loam_features, lio_sam_features])
-def test_what_found_no_room_is_said(features):
+def test_points_beyond_the_capacity_are_counted(features):
     config = config_of(**SMALL | {"rings": 6, "surface_points": 100})
     found = features_of(features, config, LOAM_PARAMS, random_scan(0))
     surface = found.less_flat if features is loam_features else found.surface

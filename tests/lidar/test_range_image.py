@@ -94,7 +94,7 @@ def test_the_position_in_its_ring_is_a_running_count():
             assert count[number] == here.sum()
 
 
-def test_a_ring_that_is_too_long_is_thinned_evenly_and_said():
+def test_a_ring_that_is_too_long_is_thinned_evenly_and_its_loss_counted():
     azimuth = np.linspace(0, 6, 1000)
     points = 10 * np.c_[np.cos(azimuth), np.sin(azimuth), np.zeros(1000)]
     scan = scan_of(np.r_[points, points[:50]], np.r_[np.zeros(1000), np.ones(50)])
@@ -108,7 +108,7 @@ def test_a_ring_that_is_too_long_is_thinned_evenly_and_said():
     assert long[-1] > 990
 
 
-def test_rings_beyond_the_configured_ones_are_said_to_be_dropped():
+def test_points_of_rings_beyond_the_configured_ones_are_counted_as_dropped():
     scan = random_scan(1)
     image = IMAGE(LoamRingConfig(rings=6, columns=500), LOAM_PARAMS, scan)
     assert int(image.dropped) == (kept_points(scan) & (np.asarray(scan.ring) >= 6)).sum() > 0

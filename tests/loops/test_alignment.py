@@ -52,7 +52,7 @@ def test_a_guess_is_not_touched_by_the_others(places):
     assert np.linalg.norm((np.linalg.inv(TRUTH) @ together.T_target_source[0])[:3, 3]) > 1.0
 
 
-def test_what_two_parallel_walls_and_the_ground_leave_open_is_said(places):
+def test_the_direction_that_two_parallel_walls_leave_open_is_reported(places):
     target, source = places
     hall = target[
         (np.abs(target[:, 1] - 17) < 0.2) | (np.abs(target[:, 1] + 15) < 0.2) | (target[:, 2] < -1.4)

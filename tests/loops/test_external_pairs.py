@@ -55,7 +55,7 @@ def test_a_missing_file_is_a_wrong_request(tmp_path):
         read_pairs(tmp_path / "none.txt")
 
 
-def test_a_file_that_is_no_text_is_said_to_be_none(tmp_path):
+def test_a_file_that_is_not_text_is_an_error(tmp_path):
     path = tmp_path / "pairs.txt"
     path.write_bytes(b"\xff\xfe\x00\x81")
     with pytest.raises(LioJaxError, match="not a text file"):

@@ -111,7 +111,7 @@ def test_numbers_keep_their_digits(tmp_path):
     np.testing.assert_allclose(vertices[0], pose, rtol=1e-11, atol=1e-11)
 
 
-def test_nothing_is_left_beside_the_file(tmp_path, graph):
+def test_no_temporary_file_is_left(tmp_path, graph):
     write_g2o(tmp_path / "graph.g2o", *graph)
     assert [path.name for path in tmp_path.iterdir()] == ["graph.g2o"]
 

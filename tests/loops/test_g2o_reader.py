@@ -101,7 +101,7 @@ def test_unknown_kinds_are_counted(read):
     )
 
 
-def test_duplicate_edges_are_told_and_count(read):
+def test_duplicate_edges_are_reported_and_used(read):
     file = read(*VERTICES, *EDGES, EDGES[0])
     assert file.notes == (
         "1 edge between vertices that another edge joins already (first: line 6); all count.",
@@ -109,7 +109,7 @@ def test_duplicate_edges_are_told_and_count(read):
     assert len(file.graph.i) == 3
 
 
-def test_parts_are_told(read):
+def test_the_parts_of_a_graph_are_reported(read):
     file = read(
         *VERTICES,
         f"VERTEX_SE2 8 {PLANE}",
@@ -187,7 +187,7 @@ def test_mistakes_are_one_sentence_that_names_the_line(read, tmp_path, mistake):
     assert str(refused.value) == f"{tmp_path / 'graph.g2o'}: {sentence}"
 
 
-def test_what_is_no_text_is_said(tmp_path):
+def test_a_file_that_is_not_text_is_an_error(tmp_path):
     path = tmp_path / "graph.g2o"
     path.write_bytes(bytes(range(256)))
     with pytest.raises(LioJaxError, match="not a text file"):

@@ -130,7 +130,7 @@ def test_the_graph_takes_the_drift_out(town):
 
 
 @needs_shared
-def test_a_real_receiver_beside_its_own_truth():
+def test_a_real_receiver_agrees_with_its_own_truth():
     """KITTI's INS: in the frame of its truth the fixes have no other heading."""
     sequence = open_sequence(SHARED_DATA / "kitti_raw" / "2011_09_26" / "2011_09_26_drive_0005_sync")
     gps, said = cleaned(sequence.gps(), "OXTS")

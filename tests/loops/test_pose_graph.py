@@ -176,7 +176,7 @@ def test_a_fixed_pose_has_no_covariance(graph):
     assert np.all(np.linalg.eigvalsh(covariances[1]) > 0)
 
 
-def test_an_open_pose_is_said(graph):
+def test_a_pose_without_a_covariance_is_an_error(graph):
     """One position leaves the graph's rotation open."""
     graph = with_priors_and_positions(graph, np.random.default_rng(9), priors=(), positions=(4,))
     with pytest.raises(LioJaxError, match="leave a pose open"):

@@ -84,7 +84,7 @@ def test_a_place_seen_again_is_accepted_with_its_pose(again):
     assert np.all((sigma[3:] >= LIMITS["translation_sigma"]) & (sigma[3:] < 0.5))
 
 
-def test_another_place_is_refused_whatever_the_odometry_would_allow():
+def test_another_place_is_refused_for_any_error_of_the_odometry():
     keyframes, truth, odometry = city("another street")
     for target in (10, 25):
         proposal = proposed(keyframes, truth, odometry, target, 1e5)

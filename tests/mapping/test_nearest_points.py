@@ -84,7 +84,7 @@ def test_what_is_found_is_in_the_map_and_each_point_once(scene, queries):
     assert (np.diff(np.where(real, distance, 1e9), axis=1) >= -1e-3).all()
 
 
-def test_too_few_points_are_said_to_be_infinitely_far():
+def test_missing_neighbours_are_infinitely_far():
     pmap, _, _ = put(empty_map(64), [[0.1, 0.1, 0.1], [0.7, 0.1, 0.1], [0.1, 0.8, 0.1]])
     distance, _ = ask(pmap, np.array([[0.2, 0.2, 0.2], [0.2, 0.2, 50.0]], np.float32))
     assert np.isfinite(distance).sum(1).tolist() == [3, 0]

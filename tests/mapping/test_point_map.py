@@ -102,7 +102,7 @@ def test_the_same_points_again_add_nothing():
 
 
 @pytest.mark.parametrize(("gain", "taken"), [(0.04, False), (0.06, True)])
-def test_a_point_takes_over_only_if_it_is_nearer_by_more_than_said(gain, taken):
+def test_a_point_replaces_another_only_if_it_is_nearer_by_the_margin(gain, taken):
     centre = np.full(3, VOXEL / 2)
     pmap, _, _ = put(empty_map(64), np.array([[0.15, 0, 0]]) + centre, nearer_by=0.05)
     pmap, added, _ = put(pmap, np.array([[0.15 - gain, 0, 0]]) + centre, nearer_by=0.05)
@@ -150,7 +150,7 @@ def test_ten_kilometres_away_is_as_precise_as_the_origin(anchor):
     np.testing.assert_allclose(far, by_place(held(at_home)), atol=1e-6)
 
 
-def test_a_full_table_says_what_it_dropped_and_keeps_what_it_has():
+def test_a_full_table_counts_dropped_points_and_keeps_its_own():
     points = cloud(600, 4.0, seed=7)
     pmap, _, first = put(empty_map(16), points)
     assert first > 0

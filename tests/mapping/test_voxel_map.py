@@ -136,7 +136,7 @@ def test_voxels_hold_the_mean_and_covariance_of_their_points(share):
     assert_holds(filled(points), points)
 
 
-def test_first_insertion_takes_nearly_all_points_and_says_which():
+def test_the_first_insertion_adds_nearly_all_points_and_reports_which():
     points = one_point_per_cell(4.0, 0.2, seed=1)
     vmap, report = put(empty_map(65536), points)
     added = report.added

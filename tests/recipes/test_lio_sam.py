@@ -240,7 +240,7 @@ def test_information_in_place_of_fixed_sigmas():
 
 
 @pytest.mark.parametrize("weak", [0, 1])
-def test_a_degenerate_direction_says_nothing(weak):
+def test_a_degenerate_direction_has_no_information(weak):
     """By its information: seen from the IMU, which is turned and apart from the sensor."""
     params = settings_with("config.lio_sam.lidar_noise=information").params()
     config = settings_with("config.lio_sam.lidar_noise=information").config
@@ -314,12 +314,12 @@ def test_a_nine_axis_imu_levels_the_first_pose():
         np.testing.assert_allclose(found.as_euler("ZYX"), [yaw, 0.05, -0.1], atol=1e-9)
 
 
-def test_without_samples_it_says_what_to_take_instead():
+def test_without_samples_the_error_names_another_recipe():
     with pytest.raises(UsageError, match=r"lio_sam needs inertial samples.*take loam"):
         LioSam(CONFIG).init(PARAMS, None)
 
 
-def test_a_recipe_without_sizes_says_where_they_come_from():
+def test_a_recipe_without_sizes_is_an_error_that_explains_their_source():
     with pytest.raises(UsageError, match=re.escape("settings_for(sequence, settings)")):
         LioSam(recipe_settings("lio_sam").config).init(PARAMS, arrays()[1])
 

@@ -173,7 +173,7 @@ def test_a_ring_of_a_few_points_does_no_harm(drive):
     assert ate(poses) < 0.08
 
 
-def test_scans_of_a_single_sector_are_matched_or_said_to_be_lost():
+def test_scans_of_a_single_sector_are_matched_or_reported_as_lost():
     _, outputs, poses = run(change=lambda n, scan: only(scan, one_sector), count=20)
     assert np.isfinite(poses).all()
     assert ate(poses) < 0.3
@@ -213,7 +213,7 @@ def test_eight_and_128_beams(sensor, rings):
     assert np.linalg.norm(moved[:3, 3] - expected[:3, 3]) < 0.1
 
 
-def test_a_recipe_without_sizes_says_where_they_come_from():
+def test_a_recipe_without_sizes_is_an_error_that_explains_their_source():
     settings = recipe_settings("loam")
     with pytest.raises(UsageError, match="settings_for"):
         Loam(settings.config).init(settings.params())

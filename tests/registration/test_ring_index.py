@@ -139,7 +139,7 @@ def test_a_cloud_without_points_has_no_nearest():
     assert all((place == -1).all() for place in jax.tree.leaves(found))
 
 
-def test_rings_farther_apart_count_as_told():
+def test_rings_up_to_the_given_distance_are_searched():
     points, ring = spinning(16, 128, seed=6)
     queries, everything = points[:200] + 0.05, np.ones(len(points), bool)
     for apart in (1.5, 2.5):

@@ -225,7 +225,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_what_is_wrong_is_said_in_a_sentence_with_file_and_key(case):
+def test_an_error_is_a_sentence_with_file_and_key(case):
     text, words = WRONG[case]
     with pytest.raises(UsageError) as raised:
         resolved(text)

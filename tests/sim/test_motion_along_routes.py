@@ -142,7 +142,7 @@ def test_the_seed_decides_the_sway():
     assert np.abs(poses_at(same, times) - poses_at(other, times)).max() > 1e-3
 
 
-def test_motions_are_float64_whatever_the_mode():
+def test_motions_are_float64_in_both_modes():
     with jax.enable_x64(False):
         single = motion_along(WALK, duration_s=DURATION, standstill_s=1.0, seed=2)
     for leaf, expected in zip(jax.tree.leaves(single), jax.tree.leaves(motion_of("handheld")), strict=True):

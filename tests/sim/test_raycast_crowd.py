@@ -85,7 +85,7 @@ def test_normals_are_gradients_of_the_signed_distance(crowd_rays):
     np.testing.assert_allclose(hit.normal[met], gradient, atol=1e-5)
 
 
-def test_many_rays_at_once_are_told_the_same_as_a_few_at_a_time():
+def test_many_rays_at_once_give_the_same_results_as_a_few_at_a_time():
     """A few are held against every solid in full precision; many are searched for in float32 before."""
     world = world_of(jnp.float64, **_crowd())
     rng = np.random.default_rng(8)

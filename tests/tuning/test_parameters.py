@@ -41,7 +41,7 @@ def test_extrinsics_turn_and_shift_from_their_start():
         ([], ["no parameter to tune"]),
     ],
 )
-def test_what_can_not_be_tuned_is_said_in_one_sentence(patterns, words):
+def test_what_cannot_be_tuned_is_reported_in_one_sentence(patterns, words):
     with pytest.raises(UsageError) as raised:
         free_parameters(default_params(), patterns)
     assert all(word in str(raised.value) for word in words)

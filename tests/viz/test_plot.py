@@ -80,7 +80,7 @@ def test_straight_and_long_drive(tmp_path):
     assert min(png_size(tmp_path / "a.png")) > 500
 
 
-def test_truth_of_other_times_is_left_out_and_said(tmp_path, drawn):
+def test_truth_of_other_times_is_left_out_and_reported(tmp_path, drawn):
     estimate, truth = stamped(winding_drive(20), 0), stamped(winding_drive(20))
     plot_trajectory(tmp_path / "a.png", estimate, truth, "no overlap")
     assert set(panels(drawn[0])) == {"from above", "height"}

@@ -108,7 +108,7 @@ def test_names_are_text(tmp_path):
     assert text.count("&lt;script&gt;") >= 5
 
 
-def test_truth_of_another_time_is_said(tmp_path):
+def test_truth_of_another_time_is_reported(tmp_path):
     folder = write_run(tmp_path / "run")
     (folder / "truth.tum").write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
     text = write_report(folder).read_text()
@@ -174,7 +174,7 @@ def test_a_run_is_not_compared_with_itself(folder, tmp_path):
         write_comparison([folder, folder], tmp_path / "page.html")
 
 
-def test_the_command_writes_where_it_is_told(folder, tmp_path, capsys):
+def test_the_command_writes_to_the_given_path(folder, tmp_path, capsys):
     other = write_run(tmp_path / "other")
     (other / "report.html").unlink(missing_ok=True)
     assert main(["report", str(other)]) == 0

@@ -41,5 +41,5 @@ def test_an_open_turn_is_drawn_as_its_axis():
 @pytest.mark.parametrize(
     "of", [tracked(np.full((6, 6), np.nan), 6), tracked(np.eye(6), 6, index=0), tracked(np.eye(6), 0)]
 )
-def test_nothing_is_drawn_where_nothing_is_told(of):
+def test_nothing_is_drawn_without_data(of):
     assert _unobserved(of, pose()).shape == (0, 3)

@@ -122,7 +122,7 @@ def test_layers_of_a_stack_add_up():
 
 
 @pytest.mark.parametrize("values", [np.zeros(0), np.full(3, np.nan)])
-def test_nothing_to_draw_is_said(values):
+def test_a_chart_without_data_states_that_it_has_no_values(values):
     x = np.arange(float(len(values)))
     assert "no values" in labels(line_chart([Line(x, values)], "x", "y"))
     assert "no values" in labels(box_chart({"a": values}, "y"))
