@@ -82,8 +82,10 @@ def run_sequence(
         step = step or CompiledStep(settings)
         imu, imu_notes = imu_feed(sequence, settings)
         log, times = TrajectoryLog(), StageTimes("decode", "pad", "step", "record", "total")
-        everyone: list[Sink] = [log, times]
-        for sink in _own_sinks(sequence, settings, out, start, imu, log):
+        # the log last: wherever Ctrl-C comes, the others have every scan that it has
+        everyone: list[Sink] = [times, Overflow(settings), Failures(start)]
+        everyone += [ScanLog(out / "scans.npz", start), log]
+        for sink in _result_files(sequence, settings, out, imu, log):
             stack.callback(sink.close)
             everyone.append(sink)
         everyone += sinks
@@ -111,19 +113,16 @@ def run_sequence(
     return run
 
 
-def _own_sinks(
-    sequence: Sequence, settings: Settings, out: Path, start: int, imu: ImuFeed | None, log: TrajectoryLog
+def _result_files(
+    sequence: Sequence, settings: Settings, out: Path, imu: ImuFeed | None, log: TrajectoryLog
 ) -> Iterator[Sink]:
-    """Yield what a run's results go to beside the log and the times, in the order in which they finish."""
+    """Yield the sinks that write a run's results, in the order in which they finish."""
     files = StateFiles(out, settings, log)
-    backend = settings.config.backend
-    yield from (Overflow(settings), Failures(start))
-    # with a back end the map is made of the keyframes' clouds
-    if settings.config.output.map and not (backend.loops or backend.gps):
-        yield MapFile(out / "map.pcd")
-    yield from (files, ScanLog(out / "scans.npz", start))
-    if backend.loops or backend.gps:
+    yield files
+    if settings.config.backend.loops or settings.config.backend.gps:
         yield GlobalCorrection(sequence, settings, out, files)
+    elif settings.config.output.map:
+        yield MapFile(out / "map.pcd")
     if imu and imu.samples:
         yield ImuRateFile(out / "imu_rate.tum", imu.samples, log)
 

@@ -100,9 +100,7 @@ def test_ctrl_c_keeps_what_is_corrected(tmp_path, settings):
             if result.index == 5:
                 raise KeyboardInterrupt
 
-    result = run_sequence(
-        Replay(moving()), with_overrides(settings, BOTH[:1]), tmp_path, sinks=[Interrupt()]
-    )
+    result = run_sequence(Replay(moving()), with_overrides(settings, BOTH[:1]), tmp_path, sinks=[Interrupt()])
     assert isinstance(result.interruption, KeyboardInterrupt)
     assert len(read_tum(tmp_path / "trajectory.tum")) == 6
     assert (tmp_path / "map.pcd").exists()
