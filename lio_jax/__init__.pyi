@@ -31,10 +31,11 @@ from .recipes.recipe import State as State
 from .registration.voxel_plane_icp import Frame as Frame
 from .registration.voxel_plane_icp import associate as associate
 from .registration.voxel_plane_icp import point_noise as point_noise
-from .run.run import RunResult as RunResult
 from .run.run import imu_feed as imu_feed
 from .run.run import run_sequence as run_sequence
 from .run.run import settings_for as settings_for
+from .run.sinks import RunResult as RunResult
+from .run.sinks import Sink as Sink
 from .run.track import CompiledStep as CompiledStep
 from .run.track import ScanResult as ScanResult
 from .run.track import run_steps as run_steps

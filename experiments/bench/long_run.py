@@ -17,6 +17,7 @@ import numpy as np
 from flat_over_time import resident_mb
 
 from lio_jax.commands.runtime import prepare_jax
+from lio_jax.run.sinks import Sink
 
 _MB = 2**20
 
@@ -61,7 +62,7 @@ def driven(options: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         store, watch = Path(folder) / "keyframes", _Watch(60 * options.minutes)
         watch.store = store
-        run = run_sequence(sequence, settings, Path(folder), observers=(watch,))
+        run = run_sequence(sequence, settings, Path(folder), sinks=(watch,))
         ended = time.perf_counter()
         found = run.metrics["backend"]
     stages = zip(run.stage_ms["total"], run.stage_ms["record"], strict=False)
@@ -82,7 +83,7 @@ def driven(options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-class _Watch:
+class _Watch(Sink):
     """Notes memory and keyframes after each scan and ends the run when its time is up."""
 
     def __init__(self, seconds: float) -> None:
@@ -93,7 +94,7 @@ class _Watch:
         self.last = time.perf_counter()
         self._until = self.last + seconds
 
-    def __call__(self, tracked: Any, scan_ms: float) -> None:
+    def take(self, result: Any) -> None:
         self.memory_mb.append(resident_mb())
         if len(self.memory_mb) % 100 == 1:
             files = list(self.store.glob("*.npz")) if self.store else []

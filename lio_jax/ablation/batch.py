@@ -2,22 +2,21 @@
 
 import time
 from collections.abc import Sequence as Listing
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from lio_jax.core.errors import LioJaxError
 from lio_jax.core.xla import PerShape
 from lio_jax.data.prefetch import prefetched
 from lio_jax.data.sequence import Sequence
 from lio_jax.recipes import recipe_named
 from lio_jax.recipes.params import RecipeConfig as Config
-from lio_jax.run.logs import Overflow, TrajectoryLog
-from lio_jax.run.run import check_start, failure_record, imu_feed, percentiles
-from lio_jax.run.track import ResultBuilder, ScanResult, run_steps, scan_inputs
+from lio_jax.run.logs import Failures, Overflow, StageTimes, TrajectoryLog
+from lio_jax.run.run import check_start, imu_feed, nothing_read, prediction
+from lio_jax.run.sinks import RunResult, Sink, finish_all
+from lio_jax.run.track import ResultBuilder, run_steps, scan_inputs
 from lio_jax.settings.settings import Settings
 
 
@@ -36,15 +35,6 @@ class BatchPrograms:
         return self.init.compile_s + self.step.compile_s
 
 
-@dataclass(frozen=True)
-class BatchedRun:
-    """What one parameter set gave."""
-
-    log: TrajectoryLog
-    metrics: dict[str, Any]
-    """As in metrics.json; times are the batch's, divided by its size."""
-
-
 def same_batch(settings: Settings) -> tuple[Any, ...]:
     """Return what the members of a batch have to share."""
     offset = settings.values["extrinsics"]["time_offset"]
@@ -58,8 +48,8 @@ def run_batch(
     programs: BatchPrograms,
     start: int = 0,
     count: int | None = None,
-) -> list[BatchedRun]:
-    """Run the parameter sets over a recording side by side.
+) -> list[RunResult]:
+    """Run the parameter sets over a recording side by side; times are the batch's, divided by its size.
 
     Args:
         sequence: the recording, read once.
@@ -76,57 +66,35 @@ def run_batch(
     first = settings[0]
     imu, imu_notes = imu_feed(sequence, first)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[one.params() for one in settings])
-    runs = [_Run(one, start) for one in settings]
+    judges = [ResultBuilder(one) for one in settings]
+    sinks: list[list[Sink]] = [
+        [TrajectoryLog(), StageTimes("step", "total"), Failures(start), Overflow(one)] for one in settings
+    ]
     scans: Any = prefetched(sequence.scans(start, count), first.run.data.prefetch)
-    compiled = programs.compile_s
+    compiled, tracked = programs.compile_s, False
     for fed, state, output in run_steps(_BatchStep(programs, stacked), scan_inputs(first, scans, imu)):
         nav, seen = jax.device_get((state.nav, output))
         step_s = time.perf_counter() - fed.padded_at - (programs.compile_s - compiled)
         compiled = programs.compile_s
-        for number, run in enumerate(runs):
+        tracked = True
+        for number, (judged, own_sinks) in enumerate(zip(judges, sinks, strict=True)):
             own_nav, own = jax.tree.map(lambda leaf, number=number: leaf[number], (nav, seen))
-            run.add(run.judged(fed, own_nav, own.registration, own, step_s * 1e3 / len(runs)))
-    if not len(runs[0].log):
-        reasons = " ".join(sequence.warnings_so_far)
-        raise LioJaxError(f"{sequence.info.path}: no scan could be read. {reasons}".strip())
+            result = judged(fed, own_nav, own.registration, own, step_s * 1e3 / len(judges))
+            for sink in own_sinks:
+                sink.take(result)
+    if not tracked:
+        raise nothing_read(sequence)
     shared = {
-        "prediction": "inertial samples" if imu else "constant velocity",
-        "compile_s": round((programs.compile_s - compiled_s) / len(runs), 4),
-        "wall_s": round((time.perf_counter() - began) / len(runs), 4),
+        "compile_s": round((programs.compile_s - compiled_s) / len(settings), 4),
+        "wall_s": round((time.perf_counter() - began) / len(settings), 4),
     }
-    warnings = [*sequence.warnings_so_far, *imu_notes, *(imu.warnings() if imu else ())]
-    return [BatchedRun(run.log, run.metrics() | shared | run.warned(warnings)) for run in runs]
+    return [_finished(one, prediction(sequence, imu, imu_notes) | shared) for one in sinks]
 
 
-class _Run:
-    """What is kept of one parameter set."""
-
-    def __init__(self, settings: Settings, start: int) -> None:
-        self.log = TrajectoryLog()
-        self.judged = ResultBuilder(settings)
-        self._start = start
-        self._overflow = Overflow(settings)
-        self._failures: list[dict[str, Any]] = []
-        self._stage_ms: dict[str, list[float]] = {"step": [], "total": []}
-
-    def add(self, tracked: ScanResult) -> None:
-        self.log.append(tracked)
-        self._overflow.add(tracked)
-        if tracked.failure:
-            self._failures.append(failure_record(self._start + tracked.index, tracked))
-        for stage, values in self._stage_ms.items():
-            values.append(tracked.stage_ms[stage])
-
-    def metrics(self) -> dict[str, Any]:
-        return {
-            "scans": len(self.log),
-            "scan_ms": {stage: percentiles(values) for stage, values in self._stage_ms.items()},
-            "failures": self._failures,
-            "overflow": self._overflow.metrics(),
-        }
-
-    def warned(self, warnings: list[str]) -> dict[str, Any]:
-        return {"warnings": [*warnings, *self._overflow.warnings()]}
+def _finished(sinks: list[Sink], metrics: dict[str, Any]) -> RunResult:
+    run = RunResult(metrics=metrics)
+    finish_all(sinks, run)
+    return run
 
 
 class _BatchStep:

@@ -124,12 +124,13 @@ def _batched(tasks: list[Task], sequence: Sequence, truth: Trajectory | None, st
         return
     for task, own, run in zip(tasks, settings, runs, strict=True):
         try:
+            if run.interruption is not None:
+                raise run.interruption
             with store.result(task.key) as folder:
-                trajectory = run.log.trajectory()
                 with atomic_path(folder / "trajectory.tum") as aside:
-                    write_tum(aside, trajectory)
+                    write_tum(aside, run.trajectory)
                 write_text(folder / "config.yaml", own.to_yaml())
-                metrics = _scored(run.metrics, trajectory, truth)
+                metrics = _scored(run.metrics, run.trajectory, truth)
                 write_json(folder / "metrics.json", metrics)
                 write_result(folder, task, own, metrics, len(tasks))
         except DiskError:

@@ -15,12 +15,13 @@ from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory, write_tum
 from lio_jax.recipes import recipe_named
 from lio_jax.run.folder import run_folder, write_json
-from lio_jax.run.run import Observer, RunResult, check_start, run_sequence, settings_for
+from lio_jax.run.run import check_start, run_sequence, settings_for
+from lio_jax.run.sinks import RunResult, Sink
+from lio_jax.run.track import ScanResult
 from lio_jax.settings.settings import Settings, load_settings, recipe_settings, with_overrides
 from lio_jax.settings.translate import ForeignKey, ForeignSettings, load_foreign_settings
 from lio_jax.viz.recording import Recording
-from lio_jax.viz.run_record import read_correction
-from lio_jax.viz.run_recording import RecordingObserver
+from lio_jax.viz.run_recording import RecordingSink
 
 
 def beneath_recipe(foreign: ForeignSettings, recipe: str | None, is_file: bool) -> Settings:
@@ -180,22 +181,15 @@ def run_into(
     remaining = max(0, info.scan_count - start)
     total = remaining if count is None else min(count, remaining)
     with ExitStack() as stack:
-        observers: list[Observer] = []
-        recording = None
+        sinks: list[Sink] = []
         if settings.run.output.recording:
             address = _live_viewer(stack) if live else None
             recording = stack.enter_context(Recording(out / "recording.rrd", total, address))
-            observers.append(RecordingObserver(recording))
-        bar = stack.enter_context(tqdm(total=total, unit="scan", disable=None, leave=False))
-        observers.append(lambda tracked, scan_ms: _advance(bar))
-        result = run_sequence(sequence, settings, out, start, count, observers)
+            sinks.append(RecordingSink(recording, out, truth))
+        sinks.append(_ProgressBar(total))
+        result = run_sequence(sequence, settings, out, start, count, sinks)
         if isinstance(result.interruption, KeyboardInterrupt):
             say("interrupted: finishing the files of what was computed ...")
-        if recording and (found := read_correction(out)):
-            loops = {name: found.strips(name == "closed") for name in ("closed", "refused")}
-            recording.log_correction(found.trajectory.positions, found.keyframes, loops)
-        if recording and truth is not None:
-            recording.log_truth(_in_world_of(result.trajectory, truth).positions)
     result.metrics["notes"] = [*sequence.info.notes, *notes]
     evaluation_text = _finish(result, truth, settings, out, info.name)
     _warn(result.metrics["warnings"])
@@ -226,8 +220,17 @@ def _live_viewer(stack: ExitStack) -> str:
     return server.stream
 
 
-def _advance(bar: Any) -> None:
-    bar.update()
+class _ProgressBar(Sink):
+    """Shows how many scans are done."""
+
+    def __init__(self, total: int) -> None:
+        self._bar = tqdm(total=total, unit="scan", disable=None, leave=False)
+
+    def take(self, result: ScanResult) -> None:
+        self._bar.update()
+
+    def close(self) -> None:
+        self._bar.close()
 
 
 def truth_of(sequence: Sequence, gt: Path | None) -> Trajectory | None:
@@ -280,17 +283,6 @@ def _finish(result: RunResult, truth: Trajectory | None, settings: Settings, out
     return text
 
 
-def _in_world_of(estimate: Trajectory, truth: Trajectory) -> Trajectory:
-    """Return the truth of the run, moved to agree with the estimate at the first instant both have."""
-    common = truth.at(estimate.stamp_ns)
-    if not len(common):
-        return truth
-    first = int(np.searchsorted(estimate.stamp_ns, common.stamp_ns[0]))
-    T_estimate_truth = estimate.poses[first] @ np.linalg.inv(common.poses[0])
-    within = (truth.stamp_ns >= estimate.stamp_ns[0]) & (truth.stamp_ns <= estimate.stamp_ns[-1])
-    return Trajectory(truth.stamp_ns[within], T_estimate_truth @ truth.poses[within])
-
-
 def _summary(result: RunResult, out: Path) -> str:
     metrics = result.metrics
     total = metrics["scan_ms"]["total"]
@@ -326,6 +318,8 @@ def _raise_if_interrupted(result: RunResult, out: Path) -> None:
     if error is None:
         return
     done = f"the first {result.metrics['scans']} scans are in {out}"
+    if error in result.unfinished:
+        raise error
     if isinstance(error, KeyboardInterrupt):
         raise LioJaxError(f"interrupted; {done}.") from error
     if isinstance(error, LioJaxError):

@@ -43,6 +43,11 @@ class BackEndThread:
         self._thread.join()
         return self._back_end.correction()
 
+    def stop(self) -> None:
+        """Let the thread end after the keyframe it is at, without waiting for it."""
+        self._stopped.set()
+        self._waiting.put(None)
+
     def _work(self) -> None:
         try:
             while (keyframe := self._waiting.get()) is not None and not self._stopped.is_set():

@@ -24,6 +24,8 @@ from lio_jax.run.backend_thread import BackEndThread
 from lio_jax.run.folder import write_json
 from lio_jax.run.keyframes import KeyframePicker, KeyframeWriter, corner_marks, read_keyframes
 from lio_jax.run.map_file import MapTiles, read_cloud
+from lio_jax.run.sinks import RunResult, Sink
+from lio_jax.run.state_files import StateFiles
 from lio_jax.run.track import ScanResult
 from lio_jax.settings.settings import Settings
 
@@ -31,16 +33,17 @@ _KEPT_SPACING = 0.4
 """Of the points that keyframes keep in memory for loops, m; on disk they have all."""
 
 
-class GlobalCorrection:
-    """Takes every scan's result and corrects the trajectory and the map beside the odometry."""
+class GlobalCorrection(Sink):
+    """Corrects the trajectory and the map beside the odometry."""
 
-    def __init__(self, sequence: Sequence, settings: Settings, out: Path) -> None:
+    def __init__(self, sequence: Sequence, settings: Settings, out: Path, files: StateFiles) -> None:
         """Begin beside a run.
 
         Args:
             sequence: whose GPS fixes are used.
             settings: ``config.backend``, ``config.loops``, ``params.loop``, ``params.gps``.
             out: the run folder.
+            files: those of the trajectory, which are written again as it is corrected; they finish before.
 
         Raises:
             LioJaxError: GPS is asked for and the recording holds none, or the file of pairs is damaged.
@@ -50,30 +53,29 @@ class GlobalCorrection:
         backend = settings.run.backend
         closer = LoopCloser(settings) if backend.loops else None
         gate = self._gate(sequence, settings) if backend.gps else None
-        self._settings, self._out = settings, out
+        self._settings, self._out, self._files = settings, out, files
         self._origin = sequence.gps().origin if gate else None  # type: ignore[union-attr]
         self._picker, self._store = KeyframePicker(settings), KeyframeWriter(out)
         self._beside = BackEndThread(BackEnd(settings, closer, gate))
 
-    def take(self, tracked: ScanResult) -> None:
+    def take(self, result: ScanResult) -> None:
         """Take the next scan's result; this never waits for the back end."""
-        keyframe = self._picker(tracked)
+        keyframe = self._picker(result)
         if keyframe is not None:
-            self._store.append(keyframe.points, corner_marks(tracked))
+            self._store.append(keyframe.points, corner_marks(result))
             self._beside.add(replace(keyframe, points=thinned(keyframe.points, _KEPT_SPACING)))
 
-    def finish(
-        self, odometry: Trajectory, hurry: bool
-    ) -> tuple[Trajectory, NDArray[np.float32] | None, dict[str, Any]]:
-        """Write the corrected results; return the corrected trajectory and map, and what metrics.json says.
+    def finish(self, run: RunResult) -> None:
+        """Write the corrected results and hand them over; what waits still counts unless the run was ended.
 
-        Args:
-            odometry: T_odom_imu of all scans.
-            hurry: leave out what waits still.
+        The odometry's files are written already, so that an error here loses none of them.
         """
-        found = self._beside.finish(hurry)
+        found = self._beside.finish(hurry=run.interruption is not None)
+        run.odometry = odometry = run.trajectory
+        run.metrics["backend"] = self._said(found)
+        run.metrics["warnings"] += self._warnings()
         if not len(found.stamp_ns):
-            return odometry, None, self._said(found)
+            return
         poses = corrected_poses(
             odometry.stamp_ns, odometry.poses, found.stamp_ns, found.T_odom_imu, found.T_world_imu
         )
@@ -85,7 +87,13 @@ class GlobalCorrection:
         if found.T_enu_world is not None:
             write_json(self._out / "georeference.json", _georeference(found.T_enu_world, self._origin))
         map_points = self._written_map() if self._settings.run.output.map else None
-        return Trajectory(odometry.stamp_ns, poses), map_points, self._said(found)
+        corrected = Trajectory(odometry.stamp_ns, poses)
+        self._files.write_trajectory(corrected)
+        run.trajectory, run.map_points = corrected, map_points
+
+    def close(self) -> None:
+        """Let the back end's thread end."""
+        self._beside.stop()
 
     def _gate(self, sequence: Sequence, settings: Settings) -> GpsGate:
         recorded = sequence.gps()
@@ -131,8 +139,7 @@ class GlobalCorrection:
         }
         return said | ({"error": str(self._beside.error)} if self._beside.error else {})
 
-    def warnings(self) -> tuple[str, ...]:
-        """Return one sentence for each thing that went wrong."""
+    def _warnings(self) -> tuple[str, ...]:
         error = self._beside.error
         kind = type(error).__name__
         ended = f"the back end ended early ({kind}: {error}); what it had done until then counts."

@@ -1,6 +1,5 @@
-"""What a run keeps of every scan: state, times, match figures and overflow, and the poses at IMU rate."""
+"""What a run keeps of every scan in memory: states, match figures, times, failures and overflow."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +11,14 @@ from scipy.spatial.transform import Rotation
 from lio_jax.core.files import atomic_path
 from lio_jax.core.pose_covariance import carried, covariance_of
 from lio_jax.core.types import NavState
-from lio_jax.data.sequence import ImuData
-from lio_jax.data.trajectory import Trajectory, pose_matrices, tum_lines
-from lio_jax.imu.imu_odometry import imu_rate_trajectory
+from lio_jax.data.trajectory import Trajectory
+from lio_jax.run.sinks import RunResult, Sink
 from lio_jax.run.track import ScanResult, pose_matrix
 from lio_jax.settings.settings import Settings
 
 
-class TrajectoryLog:
-    """States in the order of the scans."""
+class TrajectoryLog(Sink):
+    """Keeps the states in the order of the scans."""
 
     def __init__(self) -> None:
         self._rows: list[dict[str, Any]] = []
@@ -29,29 +27,34 @@ class TrajectoryLog:
     def __len__(self) -> int:
         return len(self._rows)
 
-    def append(self, tracked: ScanResult) -> None:
+    def take(self, result: ScanResult) -> None:
         """Keep one result."""
-        nav, state = tracked.nav, tracked.output.covariance
-        match = _covariance(tracked) if self._rows else np.zeros((6, 6))
+        nav, state = result.nav, result.output.covariance
+        match = _covariance(result) if self._rows else np.zeros((6, 6))
         self._matches.append(match)
         # copies: a view would keep the device's memory around it
         whole = {} if state is None else {"state_covariance": np.array(state)}
         pose = whole["state_covariance"][:6, :6] if whole else match
         self._rows.append(
             {
-                "stamps_ns": np.int64(tracked.stamp_ns),
-                "poses": tracked.T_world_imu,
+                "stamps_ns": np.int64(result.stamp_ns),
+                "poses": result.T_world_imu,
                 "velocity": nav.velocity,
                 "biases": np.concatenate([nav.gyro_bias, nav.accel_bias]),
                 "gravity": nav.gravity,
                 "extrinsic": pose_matrix(nav.T_imu_lidar.wxyz_xyz),
                 "time_offset": nav.time_offset,
                 "covariance": pose,
-                "nis": np.array(tracked.output.nis),
-                "nis_dof": np.array(tracked.output.nis_dof),
+                "nis": np.array(result.output.nis),
+                "nis_dof": np.array(result.output.nis_dof),
                 **whole,
             }
         )
+
+    def finish(self, run: RunResult) -> None:
+        """Hand over the trajectory and the number of scans."""
+        run.trajectory = self.trajectory()
+        run.metrics["scans"] = len(self)
 
     def nav(self, index: int) -> NavState:
         """Return one scan's navigation state, numpy leaves."""
@@ -118,33 +121,80 @@ def _covariance(tracked: ScanResult) -> NDArray[np.float64]:
     return carried(covariance_of(np.asarray(registration.information)), T_imu_lidar)
 
 
-class ScanLog:
-    """Numbers in the order of the scans."""
+class StageTimes(Sink):
+    """Keeps the time that each stage took, ms."""
 
-    def __init__(self) -> None:
+    def __init__(self, *stages: str) -> None:
+        """Begin without times; those of stages that :attr:`ScanResult.stage_ms` lacks are added by others."""
+        self.ms: dict[str, list[float]] = {stage: [] for stage in stages}
+
+    def take(self, result: ScanResult) -> None:
+        """Keep one scan's times."""
+        for stage, value in result.stage_ms.items():
+            if stage in self.ms:
+                self.ms[stage].append(value)
+
+    def finish(self, run: RunResult) -> None:
+        """Hand over the times and their percentiles."""
+        run.stage_ms = self.ms
+        run.metrics["scan_ms"] = {stage: _percentiles(values) for stage, values in self.ms.items() if values}
+
+
+def _percentiles(values: list[float]) -> dict[str, float]:
+    median, p95, p99 = np.percentile(values, [50, 95, 99])
+    return {"median": round(median, 3), "p95": round(p95, 3), "p99": round(p99, 3)}
+
+
+class Failures(Sink):
+    """Keeps what went wrong with single scans."""
+
+    def __init__(self, start: int) -> None:
+        """Begin without any; ``start`` is the first scan's number in the recording."""
+        self._start = start
+        self._found: list[dict[str, Any]] = []
+
+    def take(self, result: ScanResult) -> None:
+        """Keep the scan's failure, if there is one."""
+        if result.failure:
+            number = self._start + result.index
+            message = f"scan {number}: {result.failure}"
+            self._found.append({"scan": number, "stamp_ns": result.stamp_ns, "message": message})
+
+    def finish(self, run: RunResult) -> None:
+        """Hand over the failures."""
+        run.metrics["failures"] = self._found
+
+
+class ScanLog(Sink):
+    """Keeps numbers in the order of the scans, and writes them at the end."""
+
+    def __init__(self, path: Path, start: int) -> None:
+        """Begin without any scan.
+
+        Args:
+            path: scans.npz.
+            start: first scan's number in the recording.
+        """
+        self._path, self._start = path, start
         self._rows: list[dict[str, Any]] = []
 
-    def append(self, number: int, tracked: ScanResult) -> None:
-        """Keep the numbers of one scan; ``number`` is its place in the recording."""
-        found = tracked.output.registration
+    def take(self, result: ScanResult) -> None:
+        """Keep the numbers of one scan."""
+        found = result.output.registration
         self._rows.append(
             {
-                "scan": number,
-                "points": tracked.scan_points,
+                "scan": self._start + result.index,
+                "points": result.scan_points,
                 "matches": int(found.matches),
                 "rmse": float(found.rmse),
                 "iterations": int(found.iterations),
                 "unobserved": int(np.sum(found.degenerate)),
-                "lost": bool(tracked.output.lost),
-                "failed": bool(tracked.failure),
+                "lost": bool(result.output.lost),
+                "failed": bool(result.failure),
             }
         )
 
-    def columns(self) -> dict[str, NDArray]:
-        """Return one quantity of all scans by name."""
-        return {name: np.array([row[name] for row in self._rows]) for name in self._rows[0]}
-
-    def write_npz(self, path: Path, stage_ms: Mapping[str, list[float]]) -> None:
+    def finish(self, run: RunResult) -> None:
         """Write every column, one row a scan.
 
         - ``scan`` number in the recording; ``points`` as recorded;
@@ -153,11 +203,15 @@ class ScanLog:
         - ``lost``: the pose is the prediction; ``failed``: metrics.json says why;
         - ``NAME_ms`` of each stage; ``total_ms`` is what a scan took, ``decode_ms`` ran on another thread;
           NaN where a run was interrupted.
+
+        Args:
+            run: with the times of the stages.
         """
-        stages = {f"{name}_ms": self._one_each(times) for name, times in stage_ms.items()}
-        with atomic_path(path) as aside:
+        columns = {name: np.array([row[name] for row in self._rows]) for name in self._rows[0]}
+        stages = {f"{name}_ms": self._one_each(times) for name, times in run.stage_ms.items()}
+        with atomic_path(self._path) as aside:
             # numpy's stubs take the keywords for its own options
-            arrays: dict[str, Any] = self.columns() | stages
+            arrays: dict[str, Any] = columns | stages
             np.savez_compressed(aside, **arrays)
 
     def _one_each(self, times: list[float]) -> NDArray[np.float64]:
@@ -171,8 +225,8 @@ _TOLERATED_SHARE = 0.05
 """Share of points without room in the map that is normal at the edge of a well-filled table."""
 
 
-class Overflow:
-    """Sums over the scans of a run."""
+class Overflow(Sink):
+    """Sums what found no room over the scans of a run."""
 
     def __init__(self, settings: Settings) -> None:
         self._largest = settings.config.lidar.buckets[-1]
@@ -182,25 +236,25 @@ class Overflow:
         self._offered = 0
         self._dropped = 0
 
-    def add(self, tracked: ScanResult) -> None:
+    def take(self, result: ScanResult) -> None:
         """Count one scan."""
-        output = tracked.output
-        self._scans_over += tracked.scan_points > self._largest
+        output = result.output
+        self._scans_over += result.scan_points > self._largest
         self._thinned_away.append(int(output.thinned_away))
         self._offered += int(np.asarray(output.points_mask).sum())
         self._dropped += int(output.map_dropped)
 
-    def metrics(self) -> dict[str, Any]:
-        """Return the sums for metrics.json."""
-        return {
+    def finish(self, run: RunResult) -> None:
+        """Hand over the sums, and a warning for each capacity that is too small for this recording."""
+        run.metrics["warnings"] += self._warnings()
+        run.metrics["overflow"] = {
             "scans_over_largest_bucket": self._scans_over,
             "cells_thinned_away_per_scan": float(np.median(self._thinned_away)),
             "map_points_offered": self._offered,
             "map_points_dropped": self._dropped,
         }
 
-    def warnings(self) -> list[str]:
-        """Return a sentence for each capacity that is too small for this recording."""
+    def _warnings(self) -> list[str]:
         sentences = []
         if self._scans_over:
             sentences.append(
@@ -213,38 +267,3 @@ class Overflow:
                 "voxels; raise config.map.capacity or lower params.map.reach."
             )
         return sentences
-
-
-_SCANS_AT_ONCE = 256
-"""Bounds the memory that a long run needs."""
-
-
-def write_imu_rate(path: Path, log: TrajectoryLog, imu: ImuData) -> None:
-    """Write T_world_imu at each inertial sample after the first scan's end and up to the last one's.
-
-    Poses follow the samples from the last corrected state on, so that they step where a scan corrects them; a
-    sample at a scan's end has that scan's pose. Stamps are on the lidar's clock.
-
-    Args:
-        path: TUM file.
-        log: of the run.
-        imu: stamps ascending strictly.
-    """
-    # a stream whose time steps back has no samples in between
-    stamps, poses = log.column("stamps_ns"), log.column("poses")
-    kept = np.flatnonzero(stamps > np.concatenate([[-1], np.maximum.accumulate(stamps)[:-1]]))
-    with atomic_path(path) as aside, aside.open("w") as file:
-        for first in range(0, len(kept) - 1, _SCANS_AT_ONCE):
-            chosen = kept[first : first + _SCANS_AT_ONCE + 1]
-            states = [log.nav(index) for index in chosen]
-            file.write(tum_lines(_between(stamps[chosen], poses[chosen], states, imu)))
-
-
-def _between(
-    stamps: NDArray[np.int64], poses: NDArray[np.float64], states: list[NavState], imu: ImuData
-) -> Trajectory:
-    times, rows = imu_rate_trajectory(stamps, states, imu.stamp_ns, imu.gyro, imu.accel)
-    found = pose_matrices(rows[:, 4:], rows[:, [1, 2, 3, 0]]) if len(rows) else np.zeros((0, 4, 4))
-    at = np.searchsorted(stamps, times).clip(max=len(stamps) - 1)
-    found = np.where((stamps[at] == times)[:, None, None], poses[at], found)
-    return Trajectory(times, found)

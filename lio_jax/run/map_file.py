@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.core.files import aside_of, atomic_path
+from lio_jax.run.sinks import RunResult, Sink
+from lio_jax.run.track import ScanResult
 
 CLOUD_ENDINGS = (".pcd", ".ply")
 
@@ -186,20 +188,28 @@ SPOOL_SUFFIX = ".spool"
 _POINT_BYTES = 3 * np.dtype(np.float32).itemsize
 
 
-class MapFile:
-    """Points new to the map are appended to a spool file and become a PCD at the end."""
+class MapFile(Sink):
+    """Appends points new to the map to a spool file, which becomes a PCD at the end."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._spool_path = aside_of(path.with_suffix(SPOOL_SUFFIX))
         self._spool = self._spool_path.open("wb")
 
+    def take(self, result: ScanResult) -> None:
+        """Append the points that a scan adds to the map."""
+        self.append(new_map_points(result))
+
+    def finish(self, run: RunResult) -> None:
+        """Write the PCD and hand over its points."""
+        run.map_points = self.write()
+
     def append(self, points: NDArray[np.float32]) -> None:
         """Add (n, 3) points, m in world."""
         self._spool.write(np.ascontiguousarray(points, np.float32).tobytes())
 
-    def finish(self) -> NDArray[np.float32]:
-        """Write the PCD (binary, x y z) and return its (n, 3) points."""
+    def write(self) -> NDArray[np.float32]:
+        """Write the PCD (binary, x y z) and return its (n, 3) points; none can be added afterwards."""
         self._spool.close()
         # an interrupted append may have left part of a point behind
         whole = self._spool_path.stat().st_size // _POINT_BYTES
@@ -211,3 +221,10 @@ class MapFile:
         """Remove the spool file, whatever happened."""
         self._spool.close()
         self._spool_path.unlink(missing_ok=True)
+
+
+def new_map_points(result: ScanResult) -> NDArray[np.float32]:
+    """Return the (n, 3) points that a scan adds to the map, m in world."""
+    output = result.output
+    points = np.asarray(output.points)[np.asarray(output.added)]
+    return (points + np.asarray(output.origin)).astype(np.float32)

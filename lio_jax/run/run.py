@@ -5,59 +5,26 @@ import sys
 import time
 from collections.abc import Iterator
 from collections.abc import Sequence as Listing
-from contextlib import closing
-from dataclasses import dataclass, field
+from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from lio_jax.core.errors import LioJaxError, UsageError
-from lio_jax.core.files import atomic_path
 from lio_jax.data.imu_checks import cleaned
 from lio_jax.data.prefetch import prefetched
 from lio_jax.data.sequence import LidarScan, Sequence
-from lio_jax.data.trajectory import Trajectory, write_kitti_poses, write_tum
 from lio_jax.imu.params import OrientedImuConfig
-from lio_jax.pose_graph.g2o import write_g2o
 from lio_jax.recipes.params import InertialConfig
 from lio_jax.run.fitted_settings import fitted_to_surroundings, with_sensor_sizes
-from lio_jax.run.folder import environment, write_json, write_text
+from lio_jax.run.folder import environment, write_json
 from lio_jax.run.global_correction import GlobalCorrection
-from lio_jax.run.keyframes import keyframe_indices, odometry_edges
-from lio_jax.run.logs import Overflow, ScanLog, TrajectoryLog, write_imu_rate
+from lio_jax.run.logs import Failures, Overflow, ScanLog, StageTimes, TrajectoryLog
 from lio_jax.run.map_file import MapFile
 from lio_jax.run.scan_inputs import OFFSET_MARGIN_S, ImuFeed
+from lio_jax.run.sinks import RunResult, Sink, finish_all
+from lio_jax.run.state_files import ImuRateFile, StateFiles
 from lio_jax.run.track import CompiledStep, ScanResult, track
 from lio_jax.settings.settings import Settings, with_extrinsics
-
-
-class Observer(Protocol):
-    """Something that wants to see every scan's result: a recording, a progress bar."""
-
-    def __call__(self, tracked: ScanResult, scan_ms: float) -> None:
-        """Take one result; its arrays must not be kept."""
-        ...
-
-
-@dataclass
-class RunResult:
-    """What a run computed."""
-
-    trajectory: Trajectory
-    """T_world_imu at the scans' ends, corrected where there is a back end."""
-    metrics: dict[str, Any]
-    """What metrics.json holds."""
-    stage_ms: dict[str, list[float]]
-    """Time of each stage for each scan."""
-    map_points: NDArray[np.float32] | None
-    """(n, 3) m in world; None where no map was asked for."""
-    odometry: Trajectory | None = None
-    """As it was before the back end corrected it; None without one."""
-    interruption: BaseException | None = None
-    """What ended the run early, where something did."""
-    notes: list[str] = field(default_factory=list)
 
 
 def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list[str]]:
@@ -87,7 +54,7 @@ def run_sequence(
     out: Path,
     start: int = 0,
     count: int | None = None,
-    observers: Listing[Observer] = (),
+    sinks: Listing[Sink] = (),
     step: CompiledStep | None = None,
 ) -> RunResult:
     """Estimate the recording's trajectory and map, and write the run folder's files.
@@ -100,98 +67,94 @@ def run_sequence(
         out: an existing folder.
         start: first scan.
         count: number of scans; None: to the end.
-        observers: called after each scan.
+        sinks: your own, derived from :class:`lio_jax.Sink`: each takes every scan's result after the run's
+            own sinks, and finishes after them, when their files are written. What it raises in ``take`` ends
+            the run early; what it raises in ``finish`` costs its own results alone.
         step: a compiled step of the same settings, to reuse its programs.
 
     Raises:
         UsageError: the recording ends before ``start``.
         LioJaxError: no scan could be read.
     """
-    check_start(sequence, start)
-    began = time.perf_counter()
-    step = step or CompiledStep(settings)
-    imu, imu_notes = imu_feed(sequence, settings)
-    log, scan_log = TrajectoryLog(), ScanLog()
-    stage_ms: dict[str, list[float]] = {"decode": [], "pad": [], "step": [], "record": [], "total": []}
-    failures: list[dict[str, Any]] = []
-    overflow = Overflow(settings)
-    interruption: BaseException | None = None
-    backend = settings.run.backend
-    correction = GlobalCorrection(sequence, settings, out) if backend.loops or backend.gps else None
-    map_file = MapFile(out / "map.pcd") if settings.run.output.map and not correction else None
-    decoded = _timed(sequence.scans(start, count), stage_ms["decode"])
-    scans: Any = prefetched(decoded, settings.run.data.prefetch)
-    try:
+    with ExitStack() as stack:
+        for sink in sinks:
+            stack.callback(sink.close)
+        check_start(sequence, start)
+        began = time.perf_counter()
+        step = step or CompiledStep(settings)
+        imu, imu_notes = imu_feed(sequence, settings)
+        log, times = TrajectoryLog(), StageTimes("decode", "pad", "step", "record", "total")
+        # the log last: wherever Ctrl-C comes, the others have every scan that it has
+        everyone: list[Sink] = [times, Overflow(settings), Failures(start)]
+        everyone += [ScanLog(out / "scans.npz", start), log]
+        for sink in _result_files(sequence, settings, out, imu, log):
+            stack.callback(sink.close)
+            everyone.append(sink)
+        everyone += sinks
+        decoded = _timed(sequence.scans(start, count), times.ms["decode"])
+        scans: Any = prefetched(decoded, settings.run.data.prefetch)
+        interruption: BaseException | None = None
         try:
-            # closing: an observer that raises must not leave the decoding thread and its files behind
+            # closing: a sink that raises must not leave the decoding thread and its files behind
             with closing(scans):
-                for tracked in track(settings, scans, imu, step):
-                    recorded_from = time.perf_counter()
-                    for stage, value in tracked.stage_ms.items():
-                        stage_ms[stage].append(value)
-                    overflow.add(tracked)
-                    log.append(tracked)
-                    scan_log.append(start + tracked.index, tracked)
-                    if tracked.failure:
-                        failures.append(failure_record(start + tracked.index, tracked))
-                    if map_file:
-                        map_file.append(new_map_points(tracked))
-                    if correction:
-                        correction.take(tracked)
-                    for observer in observers:
-                        observer(tracked, tracked.stage_ms["total"])
-                    stage_ms["record"].append((time.perf_counter() - recorded_from) * 1e3)
+                _hand_out(track(settings, scans, imu, step), everyone, times.ms["record"])
         except (KeyboardInterrupt, Exception) as error:
             interruption = error
         if not len(log):
-            if interruption is not None:
-                raise interruption
-            reasons = " ".join(sequence.warnings_so_far)
-            raise LioJaxError(f"{sequence.info.path}: no scan could be read. {reasons}".strip())
-        map_points = map_file.finish() if map_file else None
-        trajectory = log.trajectory()
-        _write_trajectory(out, log, trajectory)
-        _write_states(out, log, settings)
-        corrected: dict[str, Any] = {}
-        if correction:
-            # over what is written already, so that a failure here loses none of it
-            trajectory, map_points, corrected = correction.finish(trajectory, interruption is not None)
-            _write_trajectory(out, log, trajectory)
-        scan_log.write_npz(out / "scans.npz", stage_ms)
-        if imu and imu.samples:
-            write_imu_rate(out / "imu_rate.tum", log, imu.samples)
-    finally:
-        if map_file:
-            map_file.close()
-    metrics = {
-        "recording": _described(sequence),
-        "scans": len(log),
-        "prediction": "inertial samples" if imu else "constant velocity",
-        "scan_ms": {stage: percentiles(values) for stage, values in stage_ms.items() if values},
+            raise interruption or nothing_read(sequence)
+        metrics = {"recording": _described(sequence), **prediction(sequence, imu, imu_notes)}
+        run = RunResult(metrics=metrics, interruption=interruption)
+        finish_all(everyone, run)
+    run.metrics |= {
         "compile_s": round(step.compile_s, 4),
         "wall_s": round(time.perf_counter() - began, 4),
         "peak_rss_mb": round(peak_rss_mb(), 1),
-        "failures": failures,
-        "warnings": [
-            *sequence.warnings_so_far,
-            *imu_notes,
-            *(imu.warnings() if imu else ()),
-            *overflow.warnings(),
-            *(correction.warnings() if correction else ()),
-        ],
-        "overflow": overflow.metrics(),
-        **({"backend": corrected} if correction else {}),
         "environment": environment(),
     }
-    write_json(out / "metrics.json", metrics)
-    return RunResult(
-        trajectory=trajectory,
-        metrics=metrics,
-        stage_ms=stage_ms,
-        map_points=map_points,
-        odometry=log.trajectory() if correction else None,
-        interruption=interruption,
-    )
+    write_json(out / "metrics.json", run.metrics)
+    return run
+
+
+def _result_files(
+    sequence: Sequence, settings: Settings, out: Path, imu: ImuFeed | None, log: TrajectoryLog
+) -> Iterator[Sink]:
+    """Yield the sinks that write a run's results, in the order in which they finish."""
+    files = StateFiles(out, settings, log)
+    yield files
+    if settings.run.backend.loops or settings.run.backend.gps:
+        yield GlobalCorrection(sequence, settings, out, files)
+    elif settings.run.output.map:
+        yield MapFile(out / "map.pcd")
+    if imu and imu.samples:
+        yield ImuRateFile(out / "imu_rate.tum", imu.samples, log)
+
+
+def _hand_out(results: Iterator[ScanResult], sinks: Listing[Sink], record_ms: list[float]) -> None:
+    for result in results:
+        began = time.perf_counter()
+        for sink in sinks:
+            sink.take(result)
+        record_ms.append((time.perf_counter() - began) * 1e3)
+
+
+def nothing_read(sequence: Sequence) -> LioJaxError:
+    """Return the error of a recording without a readable scan."""
+    reasons = " ".join(sequence.warnings_so_far)
+    return LioJaxError(f"{sequence.info.path}: no scan could be read. {reasons}".strip())
+
+
+def prediction(sequence: Sequence, imu: ImuFeed | None, imu_notes: Listing[str]) -> dict[str, Any]:
+    """Return the metrics of what predicted the motion, and the warnings so far.
+
+    Args:
+        sequence: read to its end.
+        imu: what it was fed from; None without inertial samples.
+        imu_notes: what was found wrong with them before.
+    """
+    return {
+        "prediction": "inertial samples" if imu else "constant velocity",
+        "warnings": [*sequence.warnings_so_far, *imu_notes, *(imu.warnings() if imu else ())],
+    }
 
 
 def imu_feed(sequence: Sequence, settings: Settings) -> tuple[ImuFeed | None, tuple[str, ...]]:
@@ -238,33 +201,10 @@ def check_start(sequence: Sequence, start: int) -> None:
         )
 
 
-def new_map_points(tracked: ScanResult) -> NDArray[np.float32]:
-    """Return the (n, 3) points a scan added to the map, m in world."""
-    output = tracked.output
-    points = np.asarray(output.points)[np.asarray(output.added)]
-    return (points + np.asarray(output.origin)).astype(np.float32)
-
-
 def peak_rss_mb() -> float:
     """Return the largest resident memory the process has had, MiB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)
-
-
-def _write_trajectory(out: Path, log: TrajectoryLog, trajectory: Trajectory) -> None:
-    with atomic_path(out / "trajectory.tum") as aside:
-        write_tum(aside, trajectory)
-    with atomic_path(out / "trajectory_kitti.txt") as aside:
-        write_kitti_poses(aside, trajectory.poses @ log.column("extrinsic"))
-
-
-def _write_states(out: Path, log: TrajectoryLog, settings: Settings) -> None:
-    log.write_npz(out / "states.npz")
-    output, trajectory = settings.run.output, log.trajectory()
-    chosen = keyframe_indices(trajectory.poses, output.keyframe_distance, output.keyframe_angle)
-    poses = trajectory.poses[chosen]
-    write_g2o(out / "keyframes.g2o", poses, odometry_edges(poses, log.match_covariances()[chosen]))
-    write_text(out / "config.yaml", settings.to_yaml())
 
 
 def _timed(scans: Iterator[LidarScan], decode_ms: list[float]) -> Iterator[LidarScan]:
@@ -275,15 +215,3 @@ def _timed(scans: Iterator[LidarScan], decode_ms: list[float]) -> Iterator[Lidar
             return
         decode_ms.append((time.perf_counter() - start) * 1e3)
         yield scan
-
-
-def failure_record(number: int, tracked: ScanResult) -> dict[str, Any]:
-    """Return what metrics.json says of a scan that failed; ``number``: in the recording."""
-    message = f"scan {number}: {tracked.failure}"
-    return {"scan": number, "stamp_ns": tracked.stamp_ns, "message": message}
-
-
-def percentiles(values: list[float]) -> dict[str, float]:
-    """Return what metrics.json says of a stage's times, ms."""
-    median, p95, p99 = np.percentile(values, [50, 95, 99])
-    return {"median": round(median, 3), "p95": round(p95, 3), "p99": round(p99, 3)}

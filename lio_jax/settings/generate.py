@@ -62,7 +62,7 @@ def reference() -> str:
         "",
         "Every key of a settings file and of `--set`, generated from the declarations in the code by",
         "`make settings`. `config.*` shapes arrays or chooses code: a change compiles the programs anew.",
-        "`params.*` is traced: a change compiles nothing. A recipe takes the keys that it reads and no others.",
+        "`params.*` is traced: a change compiles nothing. A recipe takes the keys that it reads alone.",
         "*Tuned* says how `lio-jax tune` varies a parameter; the others have no derivative.",
     ]
     for section in sorted(sections):

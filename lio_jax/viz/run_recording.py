@@ -1,39 +1,71 @@
 """Write a run into a recording while it goes on."""
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.error_state import ACCEL_BIAS, GYRO_BIAS, POSITION
+from lio_jax.data.trajectory import Trajectory
 from lio_jax.run.failures import weak_directions
-from lio_jax.run.run import new_map_points
+from lio_jax.run.map_file import new_map_points
+from lio_jax.run.sinks import RunResult, Sink
 from lio_jax.run.track import ScanResult, pose_matrix
 from lio_jax.viz.recording import Recording
+from lio_jax.viz.run_record import read_correction
 
 _POINTS = 5000
 
 
-class RecordingObserver:
-    """Writes every scan, thinned, and what the estimator knows after it."""
+class RecordingSink(Sink):
+    """Records every scan, thinned, and what the estimator knows after it."""
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
+    def __init__(self, recording: Recording, out: Path, truth: Trajectory | None = None) -> None:
+        """Record into an open recording, which is closed at the end of the run.
 
-    def __call__(self, tracked: ScanResult, scan_ms: float) -> None:
-        """Log one scan's result."""
-        recording, index, stamp_ns = self._recording, tracked.index, tracked.stamp_ns
-        T_world_lidar = tracked.T_world_imu @ pose_matrix(tracked.nav.T_imu_lidar.wxyz_xyz)
-        points, corners = _compensated(tracked, T_world_lidar)
-        recording.log_scan(index, stamp_ns, points, T_world_lidar, tracked.raw, corners)
-        recording.log_added(index, stamp_ns, new_map_points(tracked))
+        Args:
+            recording: to write into.
+            out: the run folder, for what the back end leaves there.
+            truth: T_truth_imu, in any frame.
+        """
+        self._recording, self._out, self._truth = recording, out, truth
+
+    def take(self, result: ScanResult) -> None:
+        """Record one scan's result."""
+        recording, index, stamp_ns = self._recording, result.index, result.stamp_ns
+        T_world_lidar = result.T_world_imu @ pose_matrix(result.nav.T_imu_lidar.wxyz_xyz)
+        points, corners = _compensated(result, T_world_lidar)
+        recording.log_scan(index, stamp_ns, points, T_world_lidar, result.raw, corners)
+        recording.log_added(index, stamp_ns, new_map_points(result))
         if np.isfinite(T_world_lidar).all():
-            recording.log_pose(index, stamp_ns, "world/imu", tracked.T_world_imu)
-            recording.log_unobserved(_unobserved(tracked, T_world_lidar))
-        values = _match(tracked) | _biases(tracked)
-        values |= {f"times/{stage}": np.asarray(ms) for stage, ms in tracked.stage_ms.items()}
-        if tracked.output.covariance is not None:
-            covariance = np.asarray(tracked.output.covariance)
+            recording.log_pose(index, stamp_ns, "world/imu", result.T_world_imu)
+            recording.log_unobserved(_unobserved(result, T_world_lidar))
+        values = _match(result) | _biases(result)
+        values |= {f"times/{stage}": np.asarray(ms) for stage, ms in result.stage_ms.items()}
+        if result.output.covariance is not None:
+            covariance = np.asarray(result.output.covariance)
             recording.log_sigma(covariance[POSITION, POSITION])
         recording.log_metrics(index, stamp_ns, values)
+
+    def finish(self, run: RunResult) -> None:
+        """Record the correction and the truth, and close the recording."""
+        if found := read_correction(self._out):
+            loops = {name: found.strips(name == "closed") for name in ("closed", "refused")}
+            self._recording.log_correction(found.trajectory.positions, found.keyframes, loops)
+        if self._truth is not None:
+            self._recording.log_truth(_in_world_of(run.trajectory, self._truth).positions)
+        self._recording.close()
+
+
+def _in_world_of(estimate: Trajectory, truth: Trajectory) -> Trajectory:
+    """Return the truth of the run, moved to agree with the estimate at the first instant both have."""
+    common = truth.at(estimate.stamp_ns)
+    if not len(common):
+        return truth
+    first = int(np.searchsorted(estimate.stamp_ns, common.stamp_ns[0]))
+    T_estimate_truth = estimate.poses[first] @ np.linalg.inv(common.poses[0])
+    within = (truth.stamp_ns >= estimate.stamp_ns[0]) & (truth.stamp_ns <= estimate.stamp_ns[-1])
+    return Trajectory(truth.stamp_ns[within], T_estimate_truth @ truth.poses[within])
 
 
 def _compensated(

@@ -58,8 +58,8 @@ def in_double_precision(settings, scans, imu):
 
 
 def test_a_batch_equals_the_runs_one_by_one(tmp_path, monkeypatch):
-    monkeypatch.setattr("lio_jax.ablation.batch.feed", in_double_precision)
-    monkeypatch.setattr("lio_jax.run.track.feed", in_double_precision)
+    monkeypatch.setattr("lio_jax.ablation.batch.scan_inputs", in_double_precision)
+    monkeypatch.setattr("lio_jax.run.track.scan_inputs", in_double_precision)
     prepare_jax()
     tasks = tasks_of(
         load_spec(write_spec(tmp_path / "spec.yaml", set={**SMALL, **DENSE}, sequences=[STANDING]))
@@ -76,7 +76,7 @@ def test_a_batch_equals_the_runs_one_by_one(tmp_path, monkeypatch):
             failure["message"].split(": ", 1)[1] for failure in run.metrics["failures"]
         ]
         poses = np.stack([one.T_world_imu for one in alone])
-        np.testing.assert_allclose(run.log.trajectory().poses, poses, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(run.trajectory.poses, poses, rtol=0, atol=1e-6)
         ends.add(poses[-1].tobytes())
     # four settings, four results
     assert len(ends) == 4

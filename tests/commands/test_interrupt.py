@@ -61,13 +61,13 @@ def test_interrupted_while_reading(cli, tmp_path, monkeypatch, scans):
 
 
 def test_interrupted_between_a_scan_and_its_record(cli, tmp_path, monkeypatch):
-    def interrupt(self, tracked, scan_ms):
-        if tracked.index == 3:
+    def interrupt(self, result):
+        if result.index == 3:
             raise KeyboardInterrupt
-        original(self, tracked, scan_ms)
+        original(self, result)
 
-    original = command.RecordingObserver.__call__
-    monkeypatch.setattr(command.RecordingObserver, "__call__", interrupt)
+    original = command.RecordingSink.take
+    monkeypatch.setattr(command.RecordingSink, "take", interrupt)
     monkeypatch.setattr(command, "open_sequence", lambda *_: Replay(moving()))
     done = cli("run", tmp_path, "--out", tmp_path / "out")
     assert done.status == 1

@@ -11,7 +11,7 @@ from lio_jax.loops.back_end import BackEnd
 from lio_jax.run.keyframes import read_keyframes
 from lio_jax.run.map_file import read_cloud
 from lio_jax.run.run import run_sequence, settings_for
-from lio_jax.settings.settings import Settings, with_overrides
+from lio_jax.run.sinks import Sink
 from lio_jax.sim.gps import GpsModel
 from lio_jax.sim.sequence import SimulatedSequence
 from tests.run.small_drive import Replay, moving
@@ -94,13 +94,12 @@ def test_a_back_end_that_fails_costs_the_correction_alone(tmp_path, settings, mo
 
 
 def test_ctrl_c_keeps_what_is_corrected(tmp_path, settings):
-    def interrupt(tracked, scan_ms):
-        if tracked.index == 5:
-            raise KeyboardInterrupt
+    class Interrupt(Sink):
+        def take(self, result):
+            if result.index == 5:
+                raise KeyboardInterrupt
 
-    result = run_sequence(
-        Replay(moving()), with_overrides(settings, BOTH[:1]), tmp_path, observers=[interrupt]
-    )
+    result = run_sequence(Replay(moving()), with_overrides(settings, BOTH[:1]), tmp_path, sinks=[Interrupt()])
     assert isinstance(result.interruption, KeyboardInterrupt)
     assert len(read_tum(tmp_path / "trajectory.tum")) == 6
     assert (tmp_path / "map.pcd").exists()

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from lio_jax.data.trajectory import Trajectory, read_tum
-from lio_jax.run import logs as imu_rate
-from lio_jax.run.logs import TrajectoryLog, write_imu_rate
+from lio_jax.run import state_files as imu_rate
+from lio_jax.run.logs import TrajectoryLog
 from lio_jax.run.run import run_sequence
-from lio_jax.settings.settings import Settings
+from lio_jax.run.state_files import write_imu_rate
 from tests.run.inertial_drive import InertialReplay, drive, errors, imu, scans
 
 

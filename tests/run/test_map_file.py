@@ -13,7 +13,7 @@ def test_points_come_back_in_order(tmp_path):
     for part in np.array_split(POINTS, 7):
         map_file.append(part)
     map_file.append(POINTS[:0])
-    np.testing.assert_array_equal(map_file.finish(), POINTS)
+    np.testing.assert_array_equal(map_file.write(), POINTS)
     map_file.close()
     np.testing.assert_array_equal(PointCloud.from_path(tmp_path / "map.pcd").numpy(("x", "y", "z")), POINTS)
     assert [entry.name for entry in tmp_path.iterdir()] == ["map.pcd"]
@@ -23,13 +23,13 @@ def test_half_a_point_of_an_interrupted_append_is_left_out(tmp_path):
     map_file = MapFile(tmp_path / "map.pcd")
     map_file.append(POINTS)
     map_file._spool.write(b"half a point"[:7])
-    np.testing.assert_array_equal(map_file.finish(), POINTS)
+    np.testing.assert_array_equal(map_file.write(), POINTS)
     map_file.close()
 
 
 def test_map_without_points_is_a_valid_file(tmp_path):
     map_file = MapFile(tmp_path / "map.pcd")
-    assert map_file.finish().shape == (0, 3)
+    assert map_file.write().shape == (0, 3)
     map_file.close()
     assert PointCloud.from_path(tmp_path / "map.pcd").points == 0
 

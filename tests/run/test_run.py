@@ -10,7 +10,7 @@ import pytest
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.data.trajectory import read_tum
 from lio_jax.run.run import run_sequence, settings_for
-from lio_jax.settings.settings import with_overrides
+from lio_jax.run.sinks import Sink
 from tests.run.small_drive import COUNT, Replay, moving, without_points
 
 FILES = [
@@ -24,12 +24,13 @@ FILES = [
 ]
 
 
-def _stop_after(scans, error):
-    def observe(tracked, scan_ms):
-        if tracked.index == scans - 1:
-            raise error
+class _StopAfter(Sink):
+    def __init__(self, scans, error):
+        self._last, self._error = scans - 1, error
 
-    return observe
+    def take(self, result):
+        if result.index == self._last:
+            raise self._error
 
 
 def _names(path):
@@ -39,7 +40,7 @@ def _names(path):
 @pytest.mark.parametrize("scans", [1, 5])
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("the disk is gone"), ValueError("a bug")])
 def test_what_was_computed_is_written(tmp_path, settings, scans, error):
-    result = run_sequence(Replay(moving()), settings, tmp_path, observers=[_stop_after(scans, error)])
+    result = run_sequence(Replay(moving()), settings, tmp_path, sinks=[_StopAfter(scans, error)])
     assert result.interruption is error
     assert len(result.trajectory) == scans
     assert len(read_tum(tmp_path / "trajectory.tum")) == scans
@@ -60,7 +61,7 @@ def test_an_interrupted_run_leaves_no_thread(tmp_path, settings):
                 closed.append(True)
 
     result = run_sequence(
-        Watched(moving() * 3), settings, tmp_path, observers=[_stop_after(2, KeyboardInterrupt())]
+        Watched(moving() * 3), settings, tmp_path, sinks=[_StopAfter(2, KeyboardInterrupt())]
     )
     assert isinstance(result.interruption, KeyboardInterrupt)
     assert closed == [True]

@@ -37,7 +37,7 @@ def result(index: int) -> ScanResult:
 def states(tmp_path: Path) -> dict[str, np.ndarray]:
     log = TrajectoryLog()
     for index in range(2):
-        log.append(result(index))
+        log.take(result(index))
     log.write_npz(tmp_path / "states.npz")
     with np.load(tmp_path / "states.npz") as file:
         return dict(file)
