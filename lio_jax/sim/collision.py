@@ -42,7 +42,6 @@ def check_clear(world: World, times: NDArray[np.float64], positions: NDArray[np.
     Raises:
         UsageError: the body comes too close to a surface; the message names the first time and place.
     """
-
     if len(times) == 0:
         return
     ahead = np.diff(positions, axis=0, append=positions[-1:])

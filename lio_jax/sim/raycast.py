@@ -118,7 +118,6 @@ def first_met(kinds: list[Kind], rays: Rays) -> tuple[Float[Array, "kinds n"], I
     that kind. The candidate's distance is then computed in full precision. The few rays that may meet another
     solid before any candidate are searched a second time.
     """
-
     found = [_candidate(kind, rays) for kind in kinds]
     distance, number, following = (jnp.stack(part) for part in zip(*found, strict=True))
     if all(_is_small(kind, rays) for kind in kinds):
@@ -171,7 +170,6 @@ def _nearest(solids: Any, rays: Rays, distance_to: Callable[..., Array]) -> _Nea
     The inner loop stores their distances in memory: XLA would otherwise fuse the loops and compute each
     distance again for each of the three results.
     """
-
     count = solids.reflectivity.shape[0]
     # the rows that fill up the last block are left out below
     fill = jnp.minimum(jnp.arange(-(-count // _TOGETHER) * _TOGETHER), count - 1)

@@ -37,7 +37,6 @@ def stairs(seed: int) -> Scene:
     The builder's frame: flights run along x from 0 to the half-landing. The first flight is at y < 0, the
     second, which leads back, at y > 0. The lobbies are at x < 0.
     """
-
     rng = np.random.default_rng(seed)
     route = _route()
     boxes = [_hull(), *(_flights(storey * _STOREY) for storey in range(_STOREYS))]
