@@ -1,9 +1,9 @@
-"""LIO-SAM's parameters in this project's terms.
+"""Translate LIO-SAM's parameters into this project's settings.
 
-Its ``extrinsicRot`` turns the IMU's vectors into the lidar's axes; ``extrinsicTrans`` is where the IMU lies
-in the lidar frame: what it calls lidar2Imu moves by +extrinsicTrans and stands behind the lidar's pose, once
-the samples are turned. Together they are T_lidar_imu, the inverse of ``params.extrinsics``; for KITTI its
-authors fill in calib_imu_to_velo.
+Its ``extrinsicRot`` rotates vectors from the IMU's axes to the lidar's axes. Its ``extrinsicTrans`` is the
+position of the IMU in the lidar frame: the transform that it calls lidar2Imu translates by +extrinsicTrans
+and multiplies the lidar's pose from the right, after the samples are rotated. Together they are T_lidar_imu,
+the inverse of ``params.extrinsics``. For KITTI its authors fill in calib_imu_to_velo.
 """
 
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ from lio_jax.data.foreign_rules import (
 )
 
 _SAME_AXES = 0.02
-"""Rotations are of the same axes if they differ by less, rad."""
+"""Two rotations are taken as equal if they differ by less than this angle, rad."""
 _FROM_NAVSAT = "odometry/gps"
 
 _OUTPUT = "names or draws what its nodes publish; a run writes a folder"
@@ -45,7 +45,7 @@ def _extrinsic_trans(value: Any, place: str, values: Mapping[str, Any]) -> tuple
 
 
 def _extrinsic_rpy(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
-    # its versions differ in whether they invert the matrix before they use it
+    # some versions invert the matrix before they use it, others do not
     of_orientations, of_samples = rotation(value, place), _rot_beside(place, values)
     if any((of_orientations * other).magnitude() < _SAME_AXES for other in (of_samples, of_samples.inv())):
         return {}, (
