@@ -1,4 +1,4 @@
-"""``--params-from``: settings from a parameter file of LIO-SAM or FAST-LIO2, and what became of its keys."""
+"""``lio-jax run``: resolve the settings, run a recording into a folder, and print the results."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -24,12 +24,12 @@ from lio_jax.viz.run_recording import RecordingObserver
 
 
 def beneath_recipe(foreign: ForeignSettings, recipe: str | None, is_file: bool) -> Settings:
-    """Return a recipe's settings with another system's on top, and a settings file's on top of those.
+    """Return the settings of a recipe, overridden by another system's, overridden by a settings file's.
 
     Args:
-        foreign: the other system's.
-        recipe: name or settings file; None: the recipe that stands for the system. So does a file that names
-            none.
+        foreign: settings from the other system's file.
+        recipe: name or settings file; None: the recipe that follows the other system's method. It is also
+            used if the settings file names no recipe.
         is_file: whether ``recipe`` is a file.
 
     Raises:
@@ -43,7 +43,7 @@ def beneath_recipe(foreign: ForeignSettings, recipe: str | None, is_file: bool) 
 
 
 def mapping_table(foreign: ForeignSettings, settings: Settings) -> str:
-    """Write each key of the file with what became of it in a run's settings."""
+    """Return a table of the file's keys, with the effect of each key on a run's settings."""
     system, recipe = foreign.system, settings.recipe
     taken = foreign.taken(recipe)
     left = [entry for entry in foreign.keys if entry not in taken]
@@ -94,12 +94,12 @@ def resolve_settings(
 ) -> Settings:
     """Return the settings of a recipe name or settings file, with ``--set`` applied.
 
-    Another system's parameters lie above the recipe's own values and beneath a settings file's; what became
-    of them is said.
+    Another system's parameters override the recipe's own values, and a settings file's values override them.
+    A printed table lists the parameters that were used.
 
     Args:
-        recipe: name or file; None: default, or the recipe that stands for the other system.
-        assignments: of ``--set``.
+        recipe: name or file; None: default, or the recipe that follows the other system's method.
+        assignments: arguments of ``--set``.
         params_from: parameter file of LIO-SAM or FAST-LIO2.
 
     Raises:
@@ -152,7 +152,7 @@ def run_and_report(
     overwrite: bool,
     live: bool = False,
 ) -> RunResult:
-    """Run a recording into a folder, evaluate against truth, draw, and say what came out.
+    """Run a recording into a folder, evaluate against truth, draw, and print a summary.
 
     Raises:
         UsageError: the recording ends before ``start``, or the folder may not be written.
@@ -218,7 +218,7 @@ def _warn(sentences: list[str]) -> None:
 
 
 def _live_viewer(stack: ExitStack) -> str:
-    """Serve a viewer for as long as the run goes on, and return where to send it what is computed."""
+    """Serve a viewer during the run, and return the address to which results are sent."""
     from lio_jax.viz.viewer import served
 
     server = stack.enter_context(served())
@@ -231,7 +231,7 @@ def _advance(bar: Any) -> None:
 
 
 def truth_of(sequence: Sequence, gt: Path | None) -> Trajectory | None:
-    """Return the recording's ground truth, or the one that a file holds.
+    """Return the recording's ground truth, or the ground truth in a file.
 
     Raises:
         UsageError: the file has no time stamps.
@@ -258,7 +258,7 @@ def _finish(result: RunResult, truth: Trajectory | None, settings: Settings, out
         except LioJaxError as error:
             say(f"warning: no comparison with the truth: {error}")
         else:
-            # the evaluation has notes of its own
+            # the evaluation adds notes of its own
             noted = [*result.metrics["notes"], *evaluation.notes]
             result.metrics |= evaluation.as_dict() | {"notes": noted}
             if result.odometry is not None:
@@ -281,7 +281,7 @@ def _finish(result: RunResult, truth: Trajectory | None, settings: Settings, out
 
 
 def _in_world_of(estimate: Trajectory, truth: Trajectory) -> Trajectory:
-    """Return the truth of the run, moved to agree with the estimate at the first instant both have."""
+    """Return the truth, moved so that it agrees with the estimate at the first instant that both have."""
     common = truth.at(estimate.stamp_ns)
     if not len(common):
         return truth

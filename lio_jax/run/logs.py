@@ -1,4 +1,4 @@
-"""What a run keeps of every scan: state, times, match figures and overflow, and the poses at IMU rate."""
+"""Records of every scan of a run: states, times, match statistics, map overflow, and IMU-rate poses."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,7 +20,7 @@ from lio_jax.run.track import ScanResult, pose_matrix
 
 
 class TrajectoryLog:
-    """States in the order of the scans."""
+    """The states after each scan, in the order of the scans."""
 
     def __init__(self) -> None:
         self._rows: list[dict[str, Any]] = []
@@ -30,11 +30,11 @@ class TrajectoryLog:
         return len(self._rows)
 
     def append(self, tracked: ScanResult) -> None:
-        """Keep one result."""
+        """Add one scan's result."""
         nav, state = tracked.nav, tracked.output.covariance
         match = _covariance(tracked) if self._rows else np.zeros((6, 6))
         self._matches.append(match)
-        # copies: a view would keep the device's memory around it
+        # copies: a view would keep the device's memory allocated
         whole = {} if state is None else {"state_covariance": np.array(state)}
         pose = whole["state_covariance"][:6, :6] if whole else match
         self._rows.append(
@@ -68,11 +68,11 @@ class TrajectoryLog:
         )
 
     def column(self, name: str) -> NDArray:
-        """Return one quantity of all scans, stacked."""
+        """Return one quantity of all scans, stacked along the first axis."""
         return np.stack([row[name] for row in self._rows])
 
     def match_covariances(self) -> NDArray[np.float64]:
-        """Return (n, 6, 6) covariances of the poses by the matches with the map alone."""
+        """Return the covariances (n, 6, 6) of the poses from the matches with the map alone."""
         return np.stack(self._matches)
 
     def trajectory(self) -> Trajectory:
@@ -80,11 +80,11 @@ class TrajectoryLog:
         return Trajectory(self.column("stamps_ns"), self.column("poses"))
 
     def lidar_poses(self) -> NDArray[np.float64]:
-        """Return (n, 4, 4) T_world_lidar at the scans' ends."""
+        """Return T_world_lidar at the scans' ends, (n, 4, 4)."""
         return self.column("poses") @ self.column("extrinsic")
 
     def write_npz(self, path: Path) -> None:
-        """Write every column, one row a scan, at the scans' ends.
+        """Write every column, with one row for each scan, at the scans' ends.
 
         - ``stamps_ns`` (n,) int64;
         - ``poses`` (n, 4, 4) T_world_imu;
@@ -93,11 +93,12 @@ class TrajectoryLog:
         - ``gravity`` (n, 3) in world, m/s^2;
         - ``extrinsic`` (n, 4, 4) T_imu_lidar;
         - ``time_offset`` (n,) s: a scan stamped t was taken at IMU time t + time_offset;
-        - ``covariance`` (n, 6, 6) of the pose's right perturbation (rotation rad, position m): the filter's,
-          which in the recipe default holds the drift of the map, too; in LiDAR odometry that of the match
-          with the map alone, NaN where unknown;
+        - ``covariance`` (n, 6, 6) of the pose's right perturbation (rotation rad, position m). Filters give
+          their own; in the recipe default it includes the drift of the map. LiDAR odometry gives that of the
+          match with the map alone; NaN where unknown;
         - ``state_covariance`` (n, 24, 24) of the whole error state, from filters only;
-        - ``nis``, ``nis_dof`` (n,) normalised innovation squared and its degrees of freedom, 0 without.
+        - ``nis``, ``nis_dof`` (n,) normalised innovation squared and its degrees of freedom, 0 without a
+          match.
         """
         with atomic_path(path) as aside:
             columns: dict[str, Any] = {name: self.column(name) for name in self._rows[0]}
@@ -111,7 +112,7 @@ def _se3(pose: NDArray[np.float64], dtype: np.dtype) -> jaxlie.SE3:
 
 
 def _covariance(tracked: ScanResult) -> NDArray[np.float64]:
-    """Carry the scan match's covariance from the lidar to the IMU at the scan's end."""
+    """Transform the scan match's covariance from the lidar to the IMU at the scan's end."""
     registration = tracked.output.registration
     T_world_lidar = pose_matrix(np.asarray(registration.T_world_lidar.wxyz_xyz))
     T_imu_lidar = np.linalg.inv(tracked.T_world_imu) @ T_world_lidar
@@ -119,13 +120,13 @@ def _covariance(tracked: ScanResult) -> NDArray[np.float64]:
 
 
 class ScanLog:
-    """Numbers in the order of the scans."""
+    """Statistics of each scan, in the order of the scans."""
 
     def __init__(self) -> None:
         self._rows: list[dict[str, Any]] = []
 
     def append(self, number: int, tracked: ScanResult) -> None:
-        """Keep the numbers of one scan; ``number`` is its place in the recording."""
+        """Add the statistics of one scan; ``number`` is its index in the recording."""
         found = tracked.output.registration
         self._rows.append(
             {
@@ -145,18 +146,18 @@ class ScanLog:
         return {name: np.array([row[name] for row in self._rows]) for name in self._rows[0]}
 
     def write_npz(self, path: Path, stage_ms: Mapping[str, list[float]]) -> None:
-        """Write every column, one row a scan.
+        """Write every column, with one row for each scan.
 
-        - ``scan`` number in the recording; ``points`` as recorded;
-        - ``matches`` points that found their counterpart in the map; ``rmse`` of their distances, m;
-        - ``iterations`` of the solve; ``unobserved`` directions of six;
-        - ``lost``: the pose is the prediction; ``failed``: metrics.json says why;
-        - ``NAME_ms`` of each stage; ``total_ms`` is what a scan took, ``decode_ms`` ran on another thread;
+        - ``scan`` index in the recording; ``points`` number of points as recorded;
+        - ``matches`` number of points with a counterpart in the map; ``rmse`` of their distances, m;
+        - ``iterations`` of the solver; ``unobserved`` number of unobserved directions of six;
+        - ``lost``: the pose is the prediction; ``failed``: metrics.json states why;
+        - ``NAME_ms`` time of each stage; ``total_ms`` time of the scan; ``decode_ms`` time on another thread;
           NaN where a run was interrupted.
         """
         stages = {f"{name}_ms": self._one_each(times) for name, times in stage_ms.items()}
         with atomic_path(path) as aside:
-            # numpy's stubs take the keywords for its own options
+            # numpy's stubs take the keywords for numpy's own options
             arrays: dict[str, Any] = self.columns() | stages
             np.savez_compressed(aside, **arrays)
 
@@ -168,11 +169,11 @@ class ScanLog:
 
 
 _TOLERATED_SHARE = 0.05
-"""Share of points without room in the map that is normal at the edge of a well-filled table."""
+"""Share of points without room in the map up to which no warning is given: a well-filled table drops some."""
 
 
 class Overflow:
-    """Sums over the scans of a run."""
+    """Sums of dropped points over the scans of a run."""
 
     def __init__(self, settings: Settings) -> None:
         self._largest = settings.config.lidar.buckets[-1]
@@ -183,7 +184,7 @@ class Overflow:
         self._dropped = 0
 
     def add(self, tracked: ScanResult) -> None:
-        """Count one scan."""
+        """Add the counts of one scan."""
         output = tracked.output
         self._scans_over += tracked.scan_points > self._largest
         self._thinned_away.append(int(output.thinned_away))
@@ -200,7 +201,7 @@ class Overflow:
         }
 
     def warnings(self) -> list[str]:
-        """Return a sentence for each capacity that is too small for this recording."""
+        """Return one sentence for each capacity that is too small for this recording."""
         sentences = []
         if self._scans_over:
             sentences.append(
@@ -216,21 +217,21 @@ class Overflow:
 
 
 _SCANS_AT_ONCE = 256
-"""Bounds the memory that a long run needs."""
+"""Number of scans processed at once, to bound the memory of a long run."""
 
 
 def write_imu_rate(path: Path, log: TrajectoryLog, imu: ImuData) -> None:
-    """Write T_world_imu at each inertial sample after the first scan's end and up to the last one's.
+    """Write T_world_imu at each inertial sample after the first scan's end, up to the last scan's end.
 
-    Poses follow the samples from the last corrected state on, so that they step where a scan corrects them; a
-    sample at a scan's end has that scan's pose. Stamps are on the lidar's clock.
+    Poses are propagated by the samples from the last corrected state, so they jump where a scan corrects
+    them. A sample at a scan's end has that scan's pose. Stamps are on the lidar's clock.
 
     Args:
-        path: TUM file.
-        log: of the run.
-        imu: stamps ascending strictly.
+        path: path of the TUM file.
+        log: trajectory log of the run.
+        imu: samples with strictly ascending stamps.
     """
-    # a stream whose time steps back has no samples in between
+    # no samples end at a scan whose time steps back: it is left out
     stamps, poses = log.column("stamps_ns"), log.column("poses")
     kept = np.flatnonzero(stamps > np.concatenate([[-1], np.maximum.accumulate(stamps)[:-1]]))
     with atomic_path(path) as aside, aside.open("w") as file:
