@@ -1,9 +1,9 @@
-"""A long drive with its back end beside it: is any scan delayed, and does memory grow but for keyframes?
+"""A long drive with its back end: is any scan delayed, and does memory grow more than the keyframes need?
 
     python experiments/bench/long_run.py [--world city] [--scans 36000] [--minutes 15] [--gps] [--json FILE]
 
-The scans of a VLP-16 are simulated while they are tracked; after so many minutes the run ends where it is. A
-scan's time is that of all stages after casting: padding, step, and handing over to the back end.
+The scans of a VLP-16 are simulated while they are tracked; after the given number of minutes the run ends. A
+scan's time is that of all stages after casting: padding, step, and the transfer to the back end.
 """
 
 import argparse
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def driven(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the times, the memory and the errors of a drive."""
+    """Return times, memory and errors of a drive."""
     from lio_jax import GpsModel, ImuModel, SimulatedSequence
     from lio_jax.core.settings import recipe_settings, with_overrides
     from lio_jax.evaluation.evaluate import evaluate
@@ -83,7 +83,7 @@ def driven(options: argparse.Namespace) -> dict[str, Any]:
 
 
 class _Watch:
-    """Notes memory and keyframes after each scan and ends the run when its time is up."""
+    """Record memory and keyframes after each scan, and end the run when its time is up."""
 
     def __init__(self, seconds: float) -> None:
         self.memory_mb: list[float] = []

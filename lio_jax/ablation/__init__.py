@@ -1,1 +1,1 @@
-"""Many runs compared fairly: each recording runs once with each settings; a table shows all results."""
+"""Many runs compared fairly: each recording runs once with each set of settings."""

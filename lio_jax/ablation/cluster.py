@@ -40,7 +40,7 @@ class Workers:
     count: Callable[[], int]
     """Function that returns the present number of workers."""
     deaths_allowed: int
-    """Number of worker deaths after which a run counts as failed."""
+    """Largest number of worker deaths during a run before the run counts as failed."""
     revive: Callable[[], None] = lambda: None
     """Function that replaces workers that have ended for good."""
 
