@@ -335,7 +335,7 @@ def optimize_graph(
 
     Args:
         graph: Pose graph, in 3D or in the plane; it needs edges, and may have vertices and FIX lines.
-        out: The same graph with the poses found.
+        out: Output: the graph with the poses of the solution.
         robust: Distrust loops that contradict the rest.
         json: Print one JSON object instead of a table.
     """
