@@ -19,7 +19,7 @@ from lio_jax.core.errors import LioJaxError, UsageError
 
 Assignments = Annotated[
     tuple[str, ...],
-    arg(name="set", metavar="PATH=VALUE ...", help="Replace settings, such as params.map.voxel_size=0.5."),
+    arg(name="set", metavar="PATH=VALUE ...", help="Replace settings, e.g. params.map.voxel_size=0.5."),
 ]
 Data = Positional[Annotated[Path, arg(metavar="DATA")]]
 Recipe = Annotated[str | None, arg(metavar="NAME|FILE.yaml")]

@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("--world", default="city")
     parser.add_argument("--scans", type=int, default=36_000)
     parser.add_argument("--minutes", type=float, default=15.0)
-    parser.add_argument("--gps", action="store_true", help="fixes with noise beside the loops")
+    parser.add_argument("--gps", action="store_true", help="use fixes with noise besides the loops")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     prepare_jax()

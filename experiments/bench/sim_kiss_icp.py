@@ -55,7 +55,7 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--bag", type=Path, help="a bag that lio-jax sim wrote, its truth beside it")
+    parser.add_argument("--bag", type=Path, help="a bag that lio-jax sim wrote, with its truth files")
     parser.add_argument("--world", default="city")
     parser.add_argument("--sensor", default="vlp16")
     parser.add_argument("--duration", type=float, default=60.0, help="s")

@@ -163,7 +163,7 @@ def _explained(comparison: Comparison) -> str:
         f"the ratio to '{comparison.spec.baseline.name}' on the same recording and seed. p (t): two-sided "
         "paired t-test of the logarithms (of the values where some are not positive); p (ranks): Wilcoxon's "
         "signed-rank test on the same pairs, from six on. The verdict takes p (t), corrected by Holm for "
-        "the number of variants, below 0.05. Times are those of runs beside each other on one machine."
+        "the number of variants, below 0.05. Times are those of parallel runs on one machine."
     )
 
 

@@ -56,7 +56,7 @@ def _clouds(folder: Path, part: Part) -> tuple[Clouds, int, str]:
         )
     if part != "whole":
         raise LioJaxError(
-            f"{folder}: map.pcd does not tell corners from surfaces, and the run kept no keyframes; take "
+            f"{folder}: map.pcd does not separate corners from surfaces, and the run kept no keyframes; take "
             "--part whole."
         )
     say(f"note: {folder}: the run kept no keyframes; its map.pcd is taken, no finer than it was saved.")

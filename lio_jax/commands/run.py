@@ -242,7 +242,7 @@ def truth_of(sequence: Sequence, gt: Path | None) -> Trajectory | None:
 
     loaded = load_trajectory(gt)
     if not loaded.stamped:
-        raise UsageError(f"{gt}: has no time stamps; give a TUM file, or KITTI poses beside their times.txt.")
+        raise UsageError(f"{gt}: has no time stamps; give a TUM file, or KITTI poses with their times.txt.")
     return loaded.trajectory
 
 

@@ -90,7 +90,7 @@ def tune(
         lambda iterate: _report(free, iterate),
     )
     if session.history:
-        say(f"note: going on after {len(session.history)} evaluations that {out / HISTORY} holds.")
+        say(f"note: continuing after {len(session.history)} evaluations in {out / HISTORY}.")
     first = np.asarray(free.first())
     with _interruptible(session, out):
         session.run(optimiser, first, _bounds(free, first), options.iterations, options.seed)
@@ -109,7 +109,7 @@ def _check(options: TuneOptions, data: tuple[Path, ...], gt: Path | None) -> Non
         )
     if options.segment is not None and options.segment < 20:
         raise UsageError(
-            f"--segment must be 20 scans or more, not {options.segment}: less tells of the start only."
+            f"--segment must be 20 scans or more, not {options.segment}: a shorter one shows the start only."
         )
     if gt is not None and len(data) > 1:
         raise UsageError("--gt goes with one recording; several have to bring their own truth.")

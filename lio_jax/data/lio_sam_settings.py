@@ -135,7 +135,7 @@ LIO_SAM = System(
         "historyKeyframeSearchTimeDiff": _of_method("params.loop.time_gap", _WITH_LOOPS),
         "historyKeyframeSearchNum": _of_method("config.loops.submap_keyframes", _WITH_LOOPS),
         "historyKeyframeFitnessScore": nothing("params.loop.* has tests of its own for a loop"),
-        "loopClosureFrequency": nothing("every keyframe is compared, beside the odometry"),
+        "loopClosureFrequency": nothing("every keyframe is compared, in parallel with the odometry"),
         "surroundingKeyframeSize": nothing("params.submap.* says which keyframes are matched with"),
         **dict.fromkeys(
             (

@@ -87,7 +87,7 @@ def match_by_index(
         raise LioJaxError(
             f"{estimate_name} holds {len(estimate)} poses and {reference_name} {len(reference)}, and without "
             "stamps they can only be paired one to one; give trajectories with stamps (TUM), put a times.txt "
-            "beside the KITTI pose file, or cut both to the same scans."
+            "into the KITTI pose file's folder, or cut both to the same scans."
         )
     finite = _finite_rows(estimate) & _finite_rows(reference)
     notes: tuple[str, ...] = ("Poses were paired by their index, because there are no stamps to match by.",)

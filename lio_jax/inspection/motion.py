@@ -56,7 +56,7 @@ class Agreement:
     """Rotation from lidar axes to IMU axes, (3, 3); None where all rotations are about one direction."""
     rotation_sigma_deg: float | None
     off_deg: float | None
-    """Angle between the assumed rotation and the observed one, deg; with one direction of rotation, of that one."""
+    """Angle between assumed and observed rotation, deg; of the axis alone if ``R_imu_lidar`` is None."""
     mirrored: bool
     """Whether one axis or all have the opposite sign, so that no rotation explains the rates."""
 
@@ -91,7 +91,7 @@ def lidar_turns(windows: list[list[LidarScan]], settings: Settings) -> Turns:
 
 
 def _middle_ns(scan: LidarScan) -> int:
-    """Return the time of the pose that the match finds; the pose at the scan's end is extrapolated from it."""
+    """Return the time of the match's pose; the pose at the scan's end is extrapolated from it."""
     return scan.stamp_ns + round(scan.duration / 2 * 1e9)
 
 

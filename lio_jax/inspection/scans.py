@@ -144,7 +144,7 @@ class ScanSummary:
                 f"{max(self.gaps):.3f} s: scans are missing there."
             )
         if len(self.rings) == 1:
-            said.append("all points carry the same ring: scan lines cannot be told apart.")
+            said.append("all points carry the same ring: scan lines cannot be separated.")
         if self.sweep and self.time_spreads and float(np.median(self.time_spreads)) == 0.0:
             said.append(
                 f"all points of a scan carry one time although a sweep takes {self.sweep:.3f} s: its motion "

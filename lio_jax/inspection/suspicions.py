@@ -35,7 +35,7 @@ def suspicions(
         return [sentence], []
     if found.correlation < _LEAST_CORRELATION:
         sentence = (
-            f"scans and gyroscope do not tell of the same turns (correlation {found.correlation:.2f}): their "
+            f"scans and gyroscope show different rotations (correlation {found.correlation:.2f}): their "
             "clocks, units or axes differ, or the scans cannot be matched."
         )
         return [sentence], []

@@ -135,7 +135,7 @@ def failure_of(now: Evidence, before: Evidence | None, settings: Settings) -> st
     if now.restarted:
         said.append(
             "the smoother's velocity or biases ran beyond params.limits or were not finite; "
-            f"it began anew at rest: {_cause(now)}."
+            f"it started again at rest: {_cause(now)}."
         )
     if now.since_last_s > limits["outage"]:
         by = "constant velocity" if _gap(now) > LONGEST_GAP or now.imu_gap_s is None else "inertial samples"
@@ -173,7 +173,7 @@ def _match_failure(now: Evidence, settings: Settings) -> str:
     if found.status == NOT_FINITE:
         return (
             f"the update was not finite ({_not_finite(found)}); state and covariance are the prediction's, "
-            "the map was left alone."
+            "the map was not changed."
         )
     if now.lost:
         needed = settings.values["registration"]["min_matches"]

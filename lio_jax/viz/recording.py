@@ -230,7 +230,7 @@ class Recording:
         )
 
     def log_unobserved(self, directions: NDArray[np.float64]) -> None:
-        """Log the (k, 3) directions that the last logged scan does not observe, lidar frame; none clears them."""
+        """Log the (k, 3) directions that the last logged scan leaves unobserved, lidar frame; none clears."""
         import rerun as rr
 
         arrows = rr.Arrows3D(vectors=_ARROW_M * directions, colors=[_ADDED_COLOUR] * len(directions))

@@ -279,7 +279,7 @@ def times(run: RunRecord) -> list[str]:
     legend = [(name, number) for number, name in enumerate(stages)]
     return [
         figure(
-            "Time of each scan", stack, "Cut off at the 99th percentile; decoding runs beside it.", legend
+            "Time of each scan", stack, "Cut off at the 99th percentile; decoding runs in parallel.", legend
         ),
         figure("Time by stage", box_chart(boxes, "time [ms]"), "Box: quartiles, whiskers: 5 and 95 %."),
     ]
