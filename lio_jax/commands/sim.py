@@ -154,9 +154,7 @@ def _trajectory(path: Path | None) -> Trajectory | None:
 
     loaded = load_trajectory(path)
     if not loaded.stamped:
-        raise UsageError(
-            f"{path}: has no time stamps; give a TUM file, or KITTI poses with their times.txt."
-        )
+        raise UsageError(f"{path}: has no time stamps; give a TUM file, or KITTI poses with their times.txt.")
     return loaded.trajectory
 
 

@@ -196,7 +196,7 @@ class StoredKeyframes:
         if part == "whole":
             return points.astype(np.float32, copy=False)
         if corner is None:
-            raise LioJaxError(f"{path}: the recipe separated no corners from surfaces; take the part 'whole'.")
+            raise LioJaxError(f"{path}: the recipe separated no corners; take the part 'whole'.")
         if corner.shape != (len(points),):
             raise LioJaxError(f"{path}: {len(points)} points, but {len(corner)} marks of corners; run again.")
         return points[corner == (part == "corner")].astype(np.float32, copy=False)

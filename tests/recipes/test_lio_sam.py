@@ -242,7 +242,7 @@ def test_information_in_place_of_fixed_sigmas():
 
 @pytest.mark.parametrize("weak", [0, 1])
 def test_a_degenerate_direction_says_nothing(weak):
-    """By its information: seen from the IMU, which is turned and apart from the sensor."""
+    """The direction's information is seen from the IMU, which is rotated and away from the sensor."""
     params = settings_with("config.lio_sam.lidar_noise=information").params()
     config = settings_with("config.lio_sam.lidar_noise=information").config
     lidar = np.diag([4e4, 5e4, 6e4, 300.0, 2e3, 3e3])
