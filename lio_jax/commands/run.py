@@ -23,6 +23,50 @@ from lio_jax.viz.run_record import read_correction
 from lio_jax.viz.run_recording import RecordingObserver
 
 
+def run(
+    data: Path,
+    recipe: str | None,
+    assignments: tuple[str, ...],
+    params_from: Path | None,
+    out: Path,
+    start: int,
+    scans: int | None,
+    gt: Path | None,
+    overwrite: bool,
+    live: bool = False,
+) -> None:
+    """Run one recording from the command line."""
+    if start < 0 or (scans is not None and scans < 1):
+        raise UsageError(f"--start must be 0 or more and --scans 1 or more, not {start} and {scans}.")
+    settings = resolve_settings(recipe, assignments, params_from)
+    sequence = open_sequence(data, settings.config.data)
+    truth = truth_of(sequence, gt)
+    if live and not settings.config.output.recording:
+        raise UsageError("--live shows the recording, and config.output.recording=false leaves it out.")
+    run_and_report(sequence, settings, out, start, scans, truth, overwrite, live)
+
+
+def run_and_report(
+    sequence: Sequence,
+    settings: Settings,
+    out: Path,
+    start: int,
+    count: int | None,
+    truth: Trajectory | None,
+    overwrite: bool,
+    live: bool = False,
+) -> RunResult:
+    """Run a recording into a folder, evaluate against truth, draw, and print a summary.
+
+    Raises:
+        UsageError: the recording ends before ``start``, or the folder may not be written.
+        LioJaxError: nothing could be read, or the run ended early; what was computed is written.
+    """
+    check_start(sequence, start)
+    with run_folder(out, overwrite):
+        return run_into(sequence, settings, out, start, count, truth, live)
+
+
 def beneath_recipe(foreign: ForeignSettings, recipe: str | None, is_file: bool) -> Settings:
     """Return the settings of a recipe, overridden by another system's, overridden by a settings file's.
 
@@ -117,50 +161,6 @@ def resolve_settings(
     if params_from is not None:
         say(mapping_table(foreign, settings))
     return settings
-
-
-def run(
-    data: Path,
-    recipe: str | None,
-    assignments: tuple[str, ...],
-    params_from: Path | None,
-    out: Path,
-    start: int,
-    scans: int | None,
-    gt: Path | None,
-    overwrite: bool,
-    live: bool = False,
-) -> None:
-    """Run one recording from the command line."""
-    if start < 0 or (scans is not None and scans < 1):
-        raise UsageError(f"--start must be 0 or more and --scans 1 or more, not {start} and {scans}.")
-    settings = resolve_settings(recipe, assignments, params_from)
-    sequence = open_sequence(data, settings.config.data)
-    truth = truth_of(sequence, gt)
-    if live and not settings.config.output.recording:
-        raise UsageError("--live shows the recording, and config.output.recording=false leaves it out.")
-    run_and_report(sequence, settings, out, start, scans, truth, overwrite, live)
-
-
-def run_and_report(
-    sequence: Sequence,
-    settings: Settings,
-    out: Path,
-    start: int,
-    count: int | None,
-    truth: Trajectory | None,
-    overwrite: bool,
-    live: bool = False,
-) -> RunResult:
-    """Run a recording into a folder, evaluate against truth, draw, and print a summary.
-
-    Raises:
-        UsageError: the recording ends before ``start``, or the folder may not be written.
-        LioJaxError: nothing could be read, or the run ended early; what was computed is written.
-    """
-    check_start(sequence, start)
-    with run_folder(out, overwrite):
-        return run_into(sequence, settings, out, start, count, truth, live)
 
 
 def run_into(

@@ -9,6 +9,49 @@ from numpy.typing import NDArray
 from lio_jax.core.config import DataConfig
 from lio_jax.data.sequence import ImuData
 
+GAP_FACTOR = 5.0
+"""An interval longer than this multiple of the median interval is a gap."""
+LARGEST = 1e5
+"""A reading above this is a fault of the recording in any unit: 10,000 g in m/s^2."""
+_NAMED_AT_MOST = 3
+_LATE_S = 0.1
+
+
+def cleaned(
+    imu: ImuData, source: str, T_imu_lidar: NDArray[np.float64] | None = None
+) -> tuple[ImuData, tuple[str, ...]]:
+    """Drop samples that cannot be used, convert units, and report the changes and the suspicions.
+
+    Dropped are samples that are not finite or impossibly large, that repeat a stamp, or that step back in
+    time. If time steps back, the longest subsequence with ascending time is kept; of several the earliest
+    one. An accelerometer in g is converted. Gaps, saturation, a gyroscope in deg/s and a specific force that
+    points down at rest are reported only. Sentences state times in s from the recording's first sample.
+
+    Args:
+        imu: samples in recorded order.
+        source: file or topic, with which the sentences begin.
+        T_imu_lidar: (4, 4) pose of the lidar in the IMU frame, whose z axis is taken as up; None: the IMU's.
+    """
+
+    origin = int(imu.stamp_ns[0]) if len(imu.stamp_ns) else 0
+    said: list[str] = []
+    imu = _only(imu, _finite(imu, said))
+    imu = _only(imu, _ascending(imu.stamp_ns, origin, said))
+    if len(imu.stamp_ns) == 0:
+        return imu, tuple(f"{source}: {sentence}" for sentence in [*said, "no IMU sample is left."])
+    scale, note = accel_scale(imu.accel, DataConfig())
+    imu = replace(imu, accel=imu.accel * scale)
+    seconds = np.asarray((imu.stamp_ns - origin) * 1e-9, np.float64)
+    said += [
+        f"{note}." if note else "",
+        gaps(imu.stamp_ns, origin),
+        *saturation(imu, seconds),
+        degrees_suspected(imu, seconds),
+        gravity_sign(imu, seconds, T_imu_lidar),
+    ]
+    return imu, tuple(f"{source}: {sentence}" for sentence in said if sentence)
+
+
 STANDARD_GRAVITY = 9.80665
 """Standard gravity, m/s^2."""
 
@@ -169,49 +212,6 @@ def _windowed(
     starts = np.flatnonzero(np.diff(index, prepend=-1))
     counts = np.diff(np.append(starts, len(index)))
     return np.add.reduceat(values, starts, axis=0) / counts[:, None]
-
-
-GAP_FACTOR = 5.0
-"""An interval longer than this multiple of the median interval is a gap."""
-LARGEST = 1e5
-"""A reading above this is a fault of the recording in any unit: 10,000 g in m/s^2."""
-_NAMED_AT_MOST = 3
-_LATE_S = 0.1
-
-
-def cleaned(
-    imu: ImuData, source: str, T_imu_lidar: NDArray[np.float64] | None = None
-) -> tuple[ImuData, tuple[str, ...]]:
-    """Drop samples that cannot be used, convert units, and report the changes and the suspicions.
-
-    Dropped are samples that are not finite or impossibly large, that repeat a stamp, or that step back in
-    time. If time steps back, the longest subsequence with ascending time is kept; of several the earliest
-    one. An accelerometer in g is converted. Gaps, saturation, a gyroscope in deg/s and a specific force that
-    points down at rest are reported only. Sentences state times in s from the recording's first sample.
-
-    Args:
-        imu: samples in recorded order.
-        source: file or topic, with which the sentences begin.
-        T_imu_lidar: (4, 4) pose of the lidar in the IMU frame, whose z axis is taken as up; None: the IMU's.
-    """
-
-    origin = int(imu.stamp_ns[0]) if len(imu.stamp_ns) else 0
-    said: list[str] = []
-    imu = _only(imu, _finite(imu, said))
-    imu = _only(imu, _ascending(imu.stamp_ns, origin, said))
-    if len(imu.stamp_ns) == 0:
-        return imu, tuple(f"{source}: {sentence}" for sentence in [*said, "no IMU sample is left."])
-    scale, note = accel_scale(imu.accel, DataConfig())
-    imu = replace(imu, accel=imu.accel * scale)
-    seconds = np.asarray((imu.stamp_ns - origin) * 1e-9, np.float64)
-    said += [
-        f"{note}." if note else "",
-        gaps(imu.stamp_ns, origin),
-        *saturation(imu, seconds),
-        degrees_suspected(imu, seconds),
-        gravity_sign(imu, seconds, T_imu_lidar),
-    ]
-    return imu, tuple(f"{source}: {sentence}" for sentence in said if sentence)
 
 
 def gaps(stamp_ns: NDArray[np.int64], origin_ns: int) -> str:

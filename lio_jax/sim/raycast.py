@@ -28,6 +28,67 @@ from lio_jax.sim.intersect import (
 from lio_jax.sim.primitives import Boxes, Cylinders, Grounds, Planes, Spheres, TiltedBoxes
 from lio_jax.sim.worlds import MovingBoxes, Part
 
+
+class Hit(eqx.Module):
+    """What each ray meets first."""
+
+    distance: Float[Array, " n"]
+    """Distance along the unit direction, m; inf where the ray meets nothing."""
+    normal: Float[Array, "n 3"]
+    """Unit normal of the surface, on the side of the ray's origin; zero where the ray meets nothing."""
+    reflectivity: Float[Array, " n"]
+    """Reflectivity of the surface, 0 to 1; zero where the ray meets nothing."""
+
+
+def cast(
+    part: Part, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], time: Float[Array, " n"]
+) -> Hit:
+    """Return the first hit of each ray.
+
+    Distances are as exact as the rays' precision allows, even where a ray grazes or barely misses a surface.
+
+    Args:
+        part: part of a world, of the same dtype as the rays.
+        origins: (n, 3) m, in the part's frame.
+        directions: (n, 3) unit vectors in the part's frame.
+        time: (n,) s, when each ray is sent, counted from the part's instant.
+
+    Returns:
+        Distance, surface normal and reflectivity per ray.
+    """
+    x, y, z = origins.T
+    dx, dy, dz = directions.T
+    rays = Rays(x, y, z, dx, dy, dz, time)
+    kinds = _kinds(part)
+    if not kinds:
+        nothing = jnp.zeros_like(rays.x)
+        return Hit(nothing + jnp.inf, jnp.zeros_like(directions), nothing)
+    distance, number = first_met(kinds, rays)
+    first, best = jnp.argmin(distance, axis=0), jnp.min(distance, axis=0)
+    normal, reflectivity = jnp.zeros_like(directions), jnp.zeros_like(best)
+    for place, kind in enumerate(kinds):
+        seen = (first == place) & jnp.isfinite(best)
+
+        def surface(
+            normal: Array,
+            reflectivity: Array,
+            kind: Kind = kind,
+            which: Array = number[place],
+            seen: Array = seen,
+        ) -> tuple[Array, Array]:
+            met = jax.tree.map(lambda leaf: leaf[which], kind.rows)
+            point = origins + jnp.where(seen, best, 0)[:, None] * directions
+            own = kind.normal(met, point, time)
+            return jnp.where(seen[:, None], own, normal), jnp.where(seen, met.reflectivity, reflectivity)
+
+        # the branch also keeps XLA from fusing all kinds into one pass, which computes each kind many times
+        normal, reflectivity = jax.lax.cond(
+            jnp.any(seen), surface, lambda *unchanged: unchanged, normal, reflectivity
+        )
+    away = jnp.sum(normal * directions, axis=1) > 0
+    return Hit(best, jnp.where(away[:, None], -normal, normal), reflectivity)
+
+
 _SHARE = 2.0**-19
 """Margin as a share of a coordinate's size: 16 float32 rounding errors, enough for a few operations."""
 
@@ -197,66 +258,6 @@ def _nearest(solids: Any, rays: Rays, distance_to: Callable[..., Array]) -> _Nea
 
 def _single(tree: _Tree) -> _Tree:
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf, tree)
-
-
-class Hit(eqx.Module):
-    """What each ray meets first."""
-
-    distance: Float[Array, " n"]
-    """Distance along the unit direction, m; inf where the ray meets nothing."""
-    normal: Float[Array, "n 3"]
-    """Unit normal of the surface, on the side of the ray's origin; zero where the ray meets nothing."""
-    reflectivity: Float[Array, " n"]
-    """Reflectivity of the surface, 0 to 1; zero where the ray meets nothing."""
-
-
-def cast(
-    part: Part, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], time: Float[Array, " n"]
-) -> Hit:
-    """Return the first hit of each ray.
-
-    Distances are as exact as the rays' precision allows, even where a ray grazes or barely misses a surface.
-
-    Args:
-        part: part of a world, of the same dtype as the rays.
-        origins: (n, 3) m, in the part's frame.
-        directions: (n, 3) unit vectors in the part's frame.
-        time: (n,) s, when each ray is sent, counted from the part's instant.
-
-    Returns:
-        Distance, surface normal and reflectivity per ray.
-    """
-    x, y, z = origins.T
-    dx, dy, dz = directions.T
-    rays = Rays(x, y, z, dx, dy, dz, time)
-    kinds = _kinds(part)
-    if not kinds:
-        nothing = jnp.zeros_like(rays.x)
-        return Hit(nothing + jnp.inf, jnp.zeros_like(directions), nothing)
-    distance, number = first_met(kinds, rays)
-    first, best = jnp.argmin(distance, axis=0), jnp.min(distance, axis=0)
-    normal, reflectivity = jnp.zeros_like(directions), jnp.zeros_like(best)
-    for place, kind in enumerate(kinds):
-        seen = (first == place) & jnp.isfinite(best)
-
-        def surface(
-            normal: Array,
-            reflectivity: Array,
-            kind: Kind = kind,
-            which: Array = number[place],
-            seen: Array = seen,
-        ) -> tuple[Array, Array]:
-            met = jax.tree.map(lambda leaf: leaf[which], kind.rows)
-            point = origins + jnp.where(seen, best, 0)[:, None] * directions
-            own = kind.normal(met, point, time)
-            return jnp.where(seen[:, None], own, normal), jnp.where(seen, met.reflectivity, reflectivity)
-
-        # the branch also keeps XLA from fusing all kinds into one pass, which computes each kind many times
-        normal, reflectivity = jax.lax.cond(
-            jnp.any(seen), surface, lambda *unchanged: unchanged, normal, reflectivity
-        )
-    away = jnp.sum(normal * directions, axis=1) > 0
-    return Hit(best, jnp.where(away[:, None], -normal, normal), reflectivity)
 
 
 def _kinds(part: Part) -> list[Kind]:
