@@ -20,8 +20,8 @@ _FARTHEST = 1e6
 def cleaned(gps: GpsData, source: str) -> tuple[GpsData, tuple[str, ...]]:
     """Drop fixes that cannot be used, give each one a covariance, and report the changes.
 
-    Dropped are positions that are not finite or impossibly far away, fixes at (0, 0) from a receiver that has
-    no frame yet, and stamps that repeat or step back. An invalid covariance stands for an unknown one.
+    A fix is dropped if its position is not finite or impossibly far away, if it is at (0, 0) because the
+    receiver has no frame yet, or if its stamp repeats or steps back. An invalid covariance counts as unknown.
 
     Args:
         gps: fixes in recorded order.

@@ -22,10 +22,11 @@ def cleaned(
 ) -> tuple[ImuData, tuple[str, ...]]:
     """Drop samples that cannot be used, convert units, and report the changes and the suspicions.
 
-    Dropped are samples that are not finite or impossibly large, that repeat a stamp, or that step back in
-    time. If time steps back, the longest subsequence with ascending time is kept; of several the earliest
-    one. An accelerometer in g is converted. Gaps, saturation, a gyroscope in deg/s and a specific force that
-    points down at rest are reported only. Sentences state times in s from the recording's first sample.
+    Samples are dropped if they are not finite or impossibly large, if they repeat a stamp, or if they step
+    back in time. If time steps back, the longest subsequence with ascending time is kept; of several the
+    earliest one. An accelerometer in g is converted. Gaps, saturation, a gyroscope in deg/s and a specific
+    force that points down at rest are reported only. Sentences state times in s from the recording's first
+    sample.
 
     Args:
         imu: samples in recorded order.

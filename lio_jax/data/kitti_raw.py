@@ -91,8 +91,8 @@ def read_timestamps(path: Path) -> NDArray[np.int64]:
 def read_oxts(folder: Path, warn: Callable[[str], None]) -> OxtsPackets | None:
     """Read ``folder``/data/*.txt with ``folder``/timestamps.txt; return None where there are no packets.
 
-    Left out with a warning are packets that do not hold 30 finite numbers, that have no timestamp, or whose
-    stamp does not ascend.
+    A packet is left out with a warning if it does not hold 30 finite numbers, if it has no timestamp, or if
+    its stamp does not ascend.
     """
     if not (folder / "data").is_dir():
         return None

@@ -30,8 +30,8 @@ class Stamped(NamedTuple, Generic[T]):
 def in_time_order(recorded: Iterable[Stamped[T]], warn: Callable[[str], None]) -> Iterator[T]:
     """Yield the items whose stamps ascend strictly.
 
-    Left out, with one sentence each, are duplicates, steps back in time, and single stamps far ahead of the
-    stamps that follow.
+    Duplicates, steps back in time, and single stamps far ahead of the stamps that follow are left out, with
+    one sentence each.
 
     Args:
         recorded: items in recorded order; up to three of them are read ahead.

@@ -39,8 +39,8 @@ def match_by_time(
 ) -> MatchedTrajectories:
     """Interpolate the reference at those stamps of the estimate that have reference poses on both sides.
 
-    Left out, and counted in ``notes``, are poses outside the reference's span, poses in holes of the
-    reference (longer than 1 s and than 5 of its median periods), and poses that are not finite.
+    A pose is left out if it is outside the reference's span, in a hole of the reference (longer than 1 s and
+    than 5 of its median periods), or not finite. ``notes`` counts these poses.
 
     Raises:
         LioJaxError: nothing is left to compare; the sentence names both time spans.
