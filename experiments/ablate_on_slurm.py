@@ -1,13 +1,13 @@
-"""An ablation on a SLURM cluster: asks for workers by dask-jobqueue, then runs ``lio-jax ablate`` on them.
+"""An ablation on a SLURM cluster: request workers with dask-jobqueue, then run ``lio-jax ablate`` on them.
 
     python experiments/ablate_on_slurm.py SPEC.yaml --out DIR --jobs 8 [--partition P] [--cores 2]
         [--memory 4GB] [--walltime 04:00:00] [--gpus 1] [--interface ib0] [--prologue LINE]
         [--report] [--retry-failed] [--print-script]
 
-Each job is one worker. Run it where jobs can be submitted and which the jobs can reach (a login node, or a
-job of its own); DIR and the recordings must be on a file system that all of them see. --print-script shows
-the job's script and submits nothing. What jobs say is in DIR.jobs. Jobs that end at their walltime are
-replaced, and a killed command goes on where it was. Needs ``pip install 'lio-jax[cluster]'``.
+Each job is one worker. Run it on a machine that can submit jobs and that the jobs can reach (a login node, or
+a job of its own). DIR and the recordings must be on a file system that all of them see. --print-script prints
+the job's script and submits nothing. The output of the jobs is in DIR.jobs. Jobs that end at their walltime
+are replaced, and a killed command continues where it was. Needs ``pip install 'lio-jax[cluster]'``.
 """
 
 import argparse
@@ -33,7 +33,7 @@ def main() -> int:
         if options.print_script:
             print(cluster.job_script())
             return 0
-        # replaces jobs that ended
+        # replaces jobs that have ended
         cluster.adapt(minimum=options.jobs, maximum=options.jobs)
         from lio_jax.commands.ablate import ablate
 
@@ -46,7 +46,7 @@ def main() -> int:
 
 
 def _job(options: argparse.Namespace) -> dict[str, Any]:
-    """Return how SLURMCluster is to write a job's script."""
+    """Return the arguments with which SLURMCluster writes a job's script."""
     return {
         "queue": options.partition,
         "cores": options.cores,

@@ -1,10 +1,11 @@
-"""The marginal likelihood of a whole recording's samples and scan matches, under richer models of a match.
+"""The marginal likelihood of a whole recording's samples and scan matches, with richer models of a match.
 
-What a smoother's evidence takes for white noise of a scan match may be something else: the world of the first
-scan is tilted by what its levelling missed; the map drifts while the vehicle drives; and a sweep compensated
-along a predicted motion keeps that motion's errors (:mod:`lio_jax.imu.sweep_mean_error`). Here each can be
-modelled, in states of their own and in the correlation of a match with the link before it. All is linearised
-once, at the states smoothed with white noise.
+A smoother's marginal likelihood takes the error of a scan match for white noise. It has other parts: the
+world of the first scan is tilted by the error of its levelling, the map drifts while the vehicle drives, and
+a sweep that is compensated with a predicted motion keeps the errors of that motion
+(:mod:`lio_jax.imu.sweep_mean_error`). Here each part can be modelled, with states of its own and with the
+correlation between a match and the link before it. The problem is linearised once, at the states that were
+smoothed with white noise.
 """
 
 from typing import NamedTuple
@@ -31,56 +32,56 @@ from lio_jax.imu.sampling import Intervals
 from lio_jax.imu.sweep_mean_error import LAG_DOF, lag_of_inputs, still_to_show
 
 WORLD_SIGMA = jnp.repeat(jnp.array([0.02, 0.001]), 3)
-"""Of the world's attitude and position in that of gravity, rad and m, where they are estimated."""
+"""Prior standard deviations of the world's attitude and position relative to gravity's world, rad and m."""
 STILL = jnp.full(POSE_DOF, 1e-6)
-"""Drift of a map that stays where it is, rad/sqrt(s) and m/sqrt(s)."""
+"""Drift of a map that does not move, rad/sqrt(s) and m/sqrt(s)."""
 _LAG = slice(NAV_DOF, NAV_DOF + LAG_DOF)
 _MOTION = jnp.array([*range(NAV_DOF), *range(NAV_DOF + LAG_DOF, NAV_DOF + LAG_DOF + 6)])
 
 
 class Sweep(eqx.Module):
-    """How a scan was compensated; a row for each but the first."""
+    """How a scan was compensated; one row for each scan but the first."""
 
     intervals: Intervals
-    """Samples since the scan before."""
+    """Samples since the previous scan."""
     start: MotionState
-    """Estimate at that scan's end, from which the motion was predicted."""
+    """Estimate at the previous scan's end, from which the motion was predicted."""
     span: Float[Array, "m 2"]
-    """That scan's end and this one's, s from this one's start."""
+    """Ends of the previous scan and of this one, s from this scan's start."""
 
 
 class Terms(eqx.Module):
-    """A recording, linearised: n scans, m = n - 1 links."""
+    """A linearised recording with n scans and m = n - 1 links."""
 
     link_residual: Float[Array, "m 15"]
     link_jacobian: Float[Array, "m 15 30"]
     per_variance: Float[Array, "m 4 21 21"]
-    """Covariance of link, lag and bias drift per squared density."""
+    """Covariance of link, lag and bias drift, per squared density."""
     match_residual: Float[Array, "n 6"]
-    """The first scan is matched with nothing; its row does not count."""
+    """Residual of each match; the first scan is matched with nothing, and its row is not used."""
     match_jacobian: Float[Array, "n 6 6"]
     lag_residual: Float[Array, "m 6"]
-    """Lag by what is known now of the estimate that the sweep was compensated from."""
+    """Lag according to the present estimate of the state from which the sweep was compensated."""
     lag_jacobian: Float[Array, "m 6 15"]
     by_world: Float[Array, "n 6 6"]
-    """Of the match by a turn and a move of the world's axes where the vehicle is."""
+    """Derivative of the match by a rotation and a translation of the world's axes at the vehicle."""
     prior: Quadratic
     prior_log_scale: Float[Array, ""]
     duration: Float[Array, " m"]
 
 
 class Noise(NamedTuple):
-    """What the likelihood is a function of."""
+    """Arguments of the likelihood."""
 
     imu: ImuParams
     match: Float[Array, "6"]
-    """Sigmas of a scan match, rad then m."""
+    """Standard deviations of a scan match, rad then m."""
     drift: Float[Array, "6"] | None
-    """Of the map in world axes, rad/sqrt(s) then m/sqrt(s); None where the first scan's world is right."""
+    """Drift of the map in world axes, rad/sqrt(s) then m/sqrt(s); None if the first scan's world is exact."""
 
 
 def lag_terms(sweep: Sweep) -> tuple[Float[Array, "6 15"], Float[Array, "4 21 21"]]:
-    """Return the lag by an error of the state that one sweep begins from, and ``Terms.per_variance``."""
+    """Return the derivative of the lag by an error of the sweep's first state, and ``Terms.per_variance``."""
     intervals, (start, end) = sweep.intervals, sweep.span
     rate = intervals.gyro - sweep.start.gyro_bias
     force = intervals.accel - sweep.start.accel_bias
@@ -109,9 +110,9 @@ def linearised(chain: Chain, states: MotionState, sweeps: Sweep) -> Terms:
     """Return a recording's terms at states near the solution.
 
     Args:
-        chain: of all scans; its scan matches' information and kernels do not matter.
-        states: where to linearise.
-        sweeps: of all scans but the first.
+        chain: chain of all scans; the information and the kernels of its scan matches are not used.
+        states: states at which to linearise.
+        sweeps: sweeps of all scans but the first.
     """
     start, end = (
         jax.tree.map(lambda leaf, cut=cut: leaf[cut], states) for cut in (slice(-1), slice(1, None))
@@ -146,13 +147,13 @@ def log_evidence(terms: Terms, noise: Noise, lag: bool) -> Float[Array, ""]:
     joint = jnp.einsum("k,nkij->nij", densities**2, terms.per_variance)
     information, of_links = jax.vmap(imu_information)(joint[:, _MOTION][:, :, _MOTION])
     links = _Factors(terms.link_residual, terms.link_jacobian, information)
-    # the first scan is not matched
+    # the first scan has no match
     by_state, by_drift = terms.match_jacobian[1:], terms.by_world[1:]
     own = jnp.concatenate([by_state, jnp.zeros((len(by_state), POSE_DOF, DOF - POSE_DOF))], axis=2)
     residual, before = terms.match_residual[1:], jnp.zeros_like(own)
     covariance = jnp.diag(noise.match**2) + jnp.zeros_like(by_state)
     if lag:
-        # given the link's residual, which is minus the noise of the motion
+        # conditioned on the link's residual, which is minus the noise of the motion
         across = joint[:, _LAG][:, :, _MOTION]
         gain = across @ information
         covariance += joint[:, _LAG, _LAG] - gain @ jnp.swapaxes(across, 1, 2)
@@ -195,7 +196,7 @@ def log_evidence(terms: Terms, noise: Noise, lag: bool) -> Float[Array, ""]:
         cost += value
     matrix = BlockTridiagonal((diagonal + jnp.swapaxes(diagonal, 1, 2)) / 2, coupling)
     step = -solve(*jax.lax.stop_gradient((factorise(jax.lax.stop_gradient(matrix)), gradients)))
-    # at its minimum the cost's derivative is that with the step held
+    # at its minimum the cost has the derivative that it has with the step held constant
     curved = jnp.einsum("ni,nij,nj->", step, matrix.diagonal, step) / 2
     curved += jnp.einsum("ni,nij,nj->", step[1:], coupling, step[:-1])
     cost += jnp.sum(gradients * step) + curved
@@ -203,14 +204,14 @@ def log_evidence(terms: Terms, noise: Noise, lag: bool) -> Float[Array, ""]:
 
 
 class _Factors(NamedTuple):
-    """Residuals between neighbouring states; ``jacobian`` by the earlier before the later one."""
+    """Residuals between neighbouring states; ``jacobian`` is by the earlier state, then by the later one."""
 
     residual: Float[Array, "m r"]
     jacobian: Float[Array, "m r s"]
     information: Float[Array, "m r r"]
 
     def widened(self, earlier: Array, later: Array) -> "_Factors":
-        """Return the same with more columns behind each state's own."""
+        """Return the factors with further columns after each state's own."""
         first, second = jnp.split(self.jacobian, 2, axis=2)
         return self._replace(jacobian=jnp.concatenate([first, earlier, second, later], axis=2))
 

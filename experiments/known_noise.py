@@ -1,4 +1,4 @@
-"""Simulated recordings of known noise, what each recipe can tell of it, and how a tuned one is judged."""
+"""Simulated recordings with known noise, the parameters that recipes can find, and checks of a result."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-# the MEMS sensor of LIO-SAM's recordings, by the densities of its own configuration
+# the MEMS sensor of LIO-SAM's recordings, with the densities of LIO-SAM's configuration
 DENSITIES = {
     "gyro_noise": 1.5636e-3,
     "accel_noise": 3.99395e-3,
@@ -19,19 +19,19 @@ TRUE = {**{f"imu.{name}": value for name, value in DENSITIES.items()}, "lidar.ra
 SURFACE = "lidar.surface_sigma"
 BLOCKS = {"pose": slice(0, 6), "velocity": slice(6, 9), "biases": slice(9, 15)}
 SETTLED = 20
-"""Scans until the start has been forgotten."""
+"""Number of scans after which the start no longer affects the estimate."""
 _MOMENT_NS = 10_000_000
 SIZE = {"beams": 32, "columns": 1024}
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """What is tuned of a recipe, and by which objective."""
+    """The parameters of a recipe that are tuned, and the objective."""
 
     free: tuple[str, ...]
     objective: str
     overrides: tuple[str, ...] = ()
-    """Settings that the recordings ask for."""
+    """Settings that the recordings need."""
 
 
 TUNINGS = {
@@ -39,7 +39,7 @@ TUNINGS = {
     "lio_sam": Tuning(
         ("imu.*_noise", "imu.*_walk", "smoother.rotation_sigma", "smoother.translation_sigma"),
         "marginal",
-        # the sensor's first biases are 20 times what LIO-SAM expects; the world's gravity is not its place's
+        # the sensor's first biases are 20 times what LIO-SAM expects; gravity differs from LIO-SAM's value
         (
             "params.initial.gyro_bias_sigma=0.01",
             "params.initial.accel_bias_sigma=0.1",
@@ -47,12 +47,12 @@ TUNINGS = {
         ),
     ),
 }
-"""By recipe. Of a scan match's sigmas nobody knows the true ones: they are tuned along."""
+"""Tunings by recipe. The true sigmas of a scan match are not known, so they are tuned as well."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """A tuning's end."""
+    """Result of a tuning."""
 
     x: np.ndarray
     sigma: np.ndarray
@@ -62,16 +62,16 @@ class Found:
 
 @dataclass(frozen=True)
 class Judged:
-    """How a filter did on one recording."""
+    """Consistency and errors of a filter on one recording."""
 
     ate_mm: float
     nees: dict[str, float]
     nis: float
-    """Not a number for a recipe without innovations."""
+    """Normalised innovation squared per degree of freedom; NaN for a recipe without innovations."""
 
 
 class Workshop:
-    """Recordings and compiled programs, shared by all tunings of one objective."""
+    """Recordings and compiled programs that all tunings of one objective share."""
 
     def __init__(
         self, recipe: str, seconds: float, objective: str, world: str, surface: bool = False
@@ -94,7 +94,7 @@ class Workshop:
         self._step: Any = None
 
     def recording(self, world: str, seed: int) -> Any:
-        """Return a simulated recording, cast once."""
+        """Return a simulated recording, which is ray cast once."""
         from lio_jax.tuning.recording import Recording
 
         if (world, seed) not in self._recordings:
@@ -103,7 +103,7 @@ class Workshop:
         return self._recordings[world, seed]
 
     def start(self, factor: float) -> np.ndarray:
-        """Return all noise at ``factor`` times its true value, the surfaces' at that of the ranges."""
+        """Return all noise at ``factor`` times its true value; the surfaces' noise is that of the ranges."""
         x = np.asarray(self.free.first()).copy()
         for place, name in enumerate(self.free.names):
             if name in TRUE or name == SURFACE:
@@ -129,7 +129,7 @@ class Workshop:
         return Found(x, sigma, losses, sum(result.scans for _, result in evaluated))
 
     def judged(self, x: np.ndarray | None, world: str, seed: int) -> Judged:
-        """Run with the parameters of ``x``, or with the shipped ones, and compare with the truth."""
+        """Run with the parameters of ``x``, or with the shipped ones for None, and compare with the truth."""
         from lio_jax.core.error_state import local
         from lio_jax.evaluation.alignment import align, position_errors
         from lio_jax.evaluation.consistency import nees
@@ -177,7 +177,7 @@ class Workshop:
         )
 
     def simplex(self, world: str, seed: int, factor: float, scans: int) -> list[tuple[int, float]]:
-        """Return the best loss by scans processed of Nelder & Mead's method on the same budget."""
+        """Return the best loss over the scans processed for Nelder & Mead's method with the same budget."""
         recording, _ = self.recording(world, seed)
         course: list[tuple[int, float]] = []
 

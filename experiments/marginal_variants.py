@@ -1,13 +1,13 @@
-"""What whole recordings' marginal likelihood finds of known noise, by how a scan match's error is modelled.
+"""Known noise as found by the marginal likelihood of whole recordings, for several models of a match's error.
 
     python experiments/marginal_variants.py [--world street] [--seeds 0 1 2] [--seconds 20] [--factor 10]
         [--json FILE]
 
 Runs lio_sam once on each simulated recording, keeps its matched poses as measurements, and maximises the
-likelihood of all samples and matches over all recordings together. The biases' walks are given but in the
-last row. "truth" has the true poses with white noise in the matches' place: the error there is the least that
-any method can have. Each cell is what was found over what is true, with the standard deviation by the
-likelihood's curvature.
+likelihood of all samples and matches over all recordings together. The biases' walks are fixed at their true
+values except in the last row. "truth" replaces the matches by the true poses with white noise: its error is a
+lower bound for every method. Each cell is the ratio of the found to the true value, with the standard
+deviation from the likelihood's curvature.
 """
 
 import argparse
@@ -34,18 +34,18 @@ from lio_jax.imu.preintegration import preintegrate_parallel
 from lio_jax.imu.sampling import sample_intervals
 
 TYPICAL = np.repeat([5e-4, 2.5e-3], 3)
-"""Sigmas of a scan match, rad and m."""
+"""Typical standard deviations of a scan match, rad and m."""
 TYPICAL_DRIFT = np.repeat([5e-4, 3e-3], 3)
-"""Of the map, rad/sqrt(s) and m/sqrt(s)."""
+"""Typical drift of the map, rad/sqrt(s) and m/sqrt(s)."""
 LEAST = 3e-5
-"""Smallest sigma, rad or m: where a motion's error stands for the match's, the latter seems to vanish."""
+"""Least standard deviation, rad or m: a match's error seems to vanish where a motion's error replaces it."""
 GRAVITY = np.array([0.0, 0.0, -9.80665])
 PRIOR_SIGMA = np.repeat([0.03, 0.03, 3.0, 0.01, 0.1], 3)
-"""Of the first state, rad, m, m/s, rad/s, m/s^2."""
+"""Prior standard deviations of the first state, rad, m, m/s, rad/s, m/s^2."""
 
 
 class Variant(NamedTuple):
-    """What a scan match's error is taken for, beside white noise."""
+    """A model of a scan match's error besides white noise."""
 
     name: str
     tilt: bool = False
@@ -53,7 +53,7 @@ class Variant(NamedTuple):
     per_axis: bool = False
     drift: bool = False
     walks: bool = False
-    """Look for the biases' walks too."""
+    """Whether the biases' walks are estimated, too."""
 
 
 VARIANTS = (
@@ -67,7 +67,7 @@ VARIANTS = (
 
 
 def noise_of(variant: Variant, x: Any) -> Noise:
-    """Return the noise of a vector of logarithms: four densities, match, drift."""
+    """Return the noise for a vector of logarithms: four densities, match, drift."""
     size = 6 if variant.per_axis else 2
     blocks = [jnp.exp(part) for part in (x[:4], x[4 : 4 + size], x[4 + size :])]
     match, drift = (part if variant.per_axis else jnp.repeat(part, 3) for part in blocks[1:])
@@ -76,7 +76,7 @@ def noise_of(variant: Variant, x: Any) -> Noise:
 
 
 def fitted(variant: Variant, recordings: list[Terms], factor: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the most likely logarithms, their standard deviations and the log-likelihood."""
+    """Return the most likely logarithms, their standard deviations, and the log-likelihood."""
 
     @jax.jit
     def single(x: Any, terms: Terms) -> Any:
@@ -87,7 +87,7 @@ def fitted(variant: Variant, recordings: list[Terms], factor: float) -> tuple[np
         return sum(float(value) for value, _ in values), np.sum([slope for _, slope in values], axis=0)
 
     pick = slice(None) if variant.per_axis else slice(None, None, 3)
-    # what is given stays at its true value
+    # fixed parameters stay at their true values
     scale = np.array([factor, factor, *[factor if variant.walks else 1.0] * 2])
     parts = [scale * np.array(list(DENSITIES.values())), TYPICAL[pick]]
     start = np.log(np.concatenate([*parts, TYPICAL_DRIFT[pick]] if variant.drift else parts))
@@ -105,7 +105,7 @@ def fitted(variant: Variant, recordings: list[Terms], factor: float) -> tuple[np
 
 
 def gathered(shop: Workshop, world: str, seed: int) -> tuple[Sweep, jaxlie.SE3, jaxlie.SE3]:
-    """Run lio_sam and return what was measured: sweeps, matched poses, and the true ones."""
+    """Run lio_sam and return the measurements: sweeps, matched poses, and the true poses."""
     from lio_jax.run.track import CompiledStep, run_steps
 
     recording, _ = shop.recording(world, seed)
@@ -165,7 +165,7 @@ def main() -> None:
     shop = Workshop("lio_sam", options.seconds, "marginal", options.world)
     held = [gathered(shop, options.world, seed) for seed in options.seeds]
     noise = np.random.default_rng(0).normal(size=(len(held), len(held[0][2].wxyz_xyz) + 1, 6))
-    # jaxlie has the translation before the rotation
+    # jaxlie stores the translation before the rotation
     twists = (noise * TYPICAL)[..., [3, 4, 5, 0, 1, 2]]
     ideal = [
         terms_of(sweeps, true @ jaxlie.SE3.exp(jnp.asarray(twist[: len(true.wxyz_xyz)])))

@@ -3,8 +3,8 @@
     python experiments/reproduce_kitti.py KITTI --out out/kitti [--recipes default loam]
         [--sequences 00 04] [--scheduler ADDRESS] [--json]
 
-KITTI is the folder that holds sequences/ and poses/. Sequences that are not there are left out and said.
-What is done is not done again: a killed command goes on where it was. Errors are the benchmark's own, over
+KITTI is the folder that holds sequences/ and poses/. Missing sequences are left out and reported. Finished
+runs are not repeated: a killed command continues where it was. Errors are those of the benchmark, over
 segments of 100 to 800 m; a sequence shorter than 100 m has none.
 """
 
@@ -34,7 +34,7 @@ PUBLISHED = [f"{number:02d}" for number in range(11)]
 
 
 def main() -> int:
-    """Run what is not done yet and print the table."""
+    """Run the sequences that are not done yet, and print the table."""
     options = _options()
     there = [name for name in options.sequences if (options.kitti / "sequences" / name / "velodyne").is_dir()]
     if missing := [name for name in options.sequences if name not in there]:
@@ -90,7 +90,7 @@ def _resolved(recipe: str) -> str:
 
 
 def _rows(comparison: Comparison, variant: str, there: list[str]) -> dict[str, dict[str, Any]]:
-    """Return translation %, rotation deg/100 m and ms per sequence; None where there are none."""
+    """Return translation %, rotation deg/100 m and ms of each sequence; None without a value."""
     found = {}
     for name in there:
         values = {

@@ -1,11 +1,12 @@
-"""What a change of the code must not change: trajectories of all recipes and gradients, bit by bit.
+"""Check that a change of the code keeps trajectories of all recipes and gradients, bit by bit.
 
 python experiments/same_results.py keep DIR [--recordings DIR]      before the change
 python experiments/same_results.py compare DIR [--recordings DIR]   after it
 
-Runs every recipe on a simulated street and, where ``--recordings`` names a folder with ``kitti_odometry`` and
-``kitti_raw``, on odometry 04 and raw drive 0005; takes gradients by twelve parameters on the street. A
-difference is printed as the largest distance between two poses, m, and between two derivatives, relative.
+Runs every recipe on a simulated street. Where ``--recordings`` names a folder with ``kitti_odometry`` and
+``kitti_raw``, also on odometry 04 and raw drive 0005. Computes gradients with respect to twelve parameters on
+the street. A difference is printed as the largest distance between two poses, m, or as the largest relative
+difference between two derivatives.
 """
 
 import argparse
@@ -20,7 +21,7 @@ from lio_jax.commands.runtime import prepare_jax
 
 RECIPES = ("default", "fast_lio2", "loam", "lio_sam")
 LONGEST = 40
-"""Scans."""
+"""Number of scans of a recording."""
 PARAMETERS = (
     "imu.*_noise",
     "imu.*_walk",
@@ -39,7 +40,7 @@ RECORDINGS = {
 
 
 def main() -> None:
-    """Keep or compare."""
+    """Keep the results, or compare them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("action", choices=("keep", "compare"))
     parser.add_argument("folder", type=Path)
@@ -63,7 +64,7 @@ def main() -> None:
 
 
 def described(kept: np.ndarray, numbers: np.ndarray) -> str:
-    """Return how far two results are apart."""
+    """Return the difference between two results in words."""
     if kept.shape != numbers.shape:
         return f"differs: {kept.shape} before, {numbers.shape} now"
     if kept.ndim == 3:

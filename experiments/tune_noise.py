@@ -1,14 +1,14 @@
-"""Find known noise again without ground truth, and judge it on recordings that it was not tuned on.
+"""Recover known noise without ground truth, and check the result on recordings that were not used for tuning.
 
     python experiments/tune_noise.py [--recipe default | lio_sam] [--worlds street city] [--seeds 0 1 2]
         [--held-out 100 101 102] [--seconds 20] [--factors 10 0.1] [--objectives noise] [--iterations 40]
         [--surface] [--simplex] [--json FILE]
 
-Simulates recordings of a MEMS sensor, starts with all noise FACTOR times its true value and tunes on each
-recording by itself: the recipe default by its innovations, lio_sam by its smoother's marginal likelihood.
-Tables: what was found over what is true; what the tuned recipe says of itself on the held-out recordings, and
-its trajectory's error there; and, with --simplex, the loss by scans processed beside that of Nelder & Mead's
-method. All worlds run with the first one's voxels.
+Simulates recordings of a MEMS sensor, starts with all noise FACTOR times its true value, and tunes on each
+recording alone: the recipe default by its innovations, lio_sam by its smoother's marginal likelihood. The
+tables show the ratio of found to true values; consistency and trajectory error of the tuned recipe on the
+held-out recordings; and, with --simplex, the loss over the scans processed, also for Nelder & Mead's method.
+All worlds run with the first world's voxel sizes.
 """
 
 import argparse
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def tables(objective: str, options: argparse.Namespace) -> dict[str, Any]:
-    """Tune, judge and print for one objective."""
+    """Tune, check and print for one objective."""
     shop = Workshop(options.recipe, options.seconds, objective, options.worlds[0], options.surface)
     names = [name.split(".")[1] for name in shop.free.names]
     true = np.array([np.log(TRUE.get(name, 1.0)) for name in shop.free.names])
@@ -61,7 +61,7 @@ def tables(objective: str, options: argparse.Namespace) -> dict[str, Any]:
             for factor in options.factors:
                 began = time.perf_counter()
                 one = shop.tuned(world, seed, factor, options.iterations)
-                # a walk that nothing is known of has no upper end
+                # the interval of a walk that is not observable has no upper end
                 with np.errstate(over="ignore"):
                     low, middle, high = (np.exp(one.x - true + k * one.sigma) for k in (-1.96, 0, 1.96))
                 cells = (f"{m:.3g} [{a:.2g}, {b:.2g}]" for a, m, b in zip(low, middle, high, strict=True))
@@ -75,7 +75,7 @@ def tables(objective: str, options: argparse.Namespace) -> dict[str, Any]:
 
 
 def judgement(shop: Workshop, found: list[Found], options: argparse.Namespace) -> dict[str, Any]:
-    """Run everything on the held-out recordings and print how sure and how right it is."""
+    """Run all results on the held-out recordings, and print their consistency and their errors."""
     middle = np.median([one.x for one in found], axis=0)
     settings: dict[str, np.ndarray | None] = {
         f"{factor:g} x": shop.start(factor) for factor in options.factors
@@ -95,7 +95,7 @@ def judgement(shop: Workshop, found: list[Found], options: argparse.Namespace) -
 
 
 def comparison(shop: Workshop, scored: Found, options: argparse.Namespace) -> list[tuple[int, float]]:
-    """Print the losses of scoring and of Nelder & Mead's method over the scans they processed."""
+    """Print the losses of scoring and of Nelder & Mead's method over the scans that they processed."""
     world, seed, factor = options.worlds[0], options.seeds[0], options.factors[0]
     course = shop.simplex(world, seed, factor, scored.scans)
     length = len(shop.recording(world, seed)[0])

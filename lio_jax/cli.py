@@ -19,7 +19,7 @@ from lio_jax.core.errors import LioJaxError, UsageError
 
 Assignments = Annotated[
     tuple[str, ...],
-    arg(name="set", metavar="PATH=VALUE ...", help="Replace settings, such as params.map.voxel_size=0.5."),
+    arg(name="set", metavar="PATH=VALUE ...", help="Replace settings, e.g. params.map.voxel_size=0.5."),
 ]
 Data = Positional[Annotated[Path, arg(metavar="DATA")]]
 Recipe = Annotated[str | None, arg(metavar="NAME|FILE.yaml")]
@@ -69,13 +69,13 @@ def sim(
 
     Args:
         world: World to move through; an unknown name lists those that exist.
-        out: What to write: *.bag (ROS 1), *.mcap or *.db3 (ROS 2), else a native folder. Beside a bag lie
-            NAME.truth.tum and NAME.truth.npz.
+        out: Output: *.bag (ROS 1), *.mcap or *.db3 (ROS 2), else a native folder. The truth of a bag goes to
+            NAME.truth.tum and NAME.truth.npz in the same folder.
         sensor: LiDAR; an unknown name lists those that exist.
         duration: Length; None means 60 s, or all of --trajectory.
-        seed: Of world, motion and noise: the same seed gives the same bytes.
-        format: Instead of what PATH's ending says, such as a ROS 2 bag folder.
-        overwrite: Replace the recording that is there.
+        seed: Seed of world, motion and noise: the same seed gives the same bytes.
+        format: Format, if PATH's ending does not state it, for example a ROS 2 bag folder.
+        overwrite: Replace an existing recording.
     """
     from lio_jax.commands.runtime import prepare_jax
     from lio_jax.commands.sim import sim as command
@@ -92,13 +92,13 @@ def inspect(
     write_config: Annotated[Path | None, arg(metavar="FILE")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Say what is in a recording, what is wrong with it and which settings fit.
+    """Show a recording's contents, its faults, and the settings that fit it.
 
     Args:
         data: Recording: KITTI folder, ROS bag or native folder.
         json: Print one JSON object instead of a table.
         write_config: Write the settings that fit, for --recipe of lio-jax run.
-        overwrite: Replace that file.
+        overwrite: Replace an existing file.
     """
     from lio_jax.commands.inspect import inspect as command
     from lio_jax.commands.runtime import prepare_jax
@@ -125,13 +125,13 @@ def run(
     Args:
         data: Recording: KITTI odometry sequence or raw drive, ROS 1 or ROS 2 bag, native folder.
         out: Folder for the results.
-        recipe: Recipe or settings file; a run's config.yaml repeats that run. None means default, or the
-            recipe of the system that --params-from is of.
+        recipe: Recipe or settings file; a run's config.yaml repeats that run. None means default, or with
+            --params-from the recipe that follows that system.
         start: First scan.
-        scans: How many scans; None means all.
+        scans: Number of scans; None means all.
         gt: Ground truth of T_world_imu (TUM, run folder or recording); None means the recording's own.
         overwrite: Replace the results of an earlier run in that folder.
-        live: Show it in a browser of this computer while it runs.
+        live: Show the run in a browser of this computer while it goes on.
     """
     from lio_jax.commands.run import run as command
     from lio_jax.commands.runtime import prepare_jax
@@ -150,7 +150,7 @@ def evaluate(
 
     Args:
         estimate: Run folder, TUM file or KITTI poses.
-        reference: The same, or a recording that holds ground truth.
+        reference: Run folder, TUM file or KITTI poses, or a recording that holds ground truth.
         json: Print one JSON object instead of a table.
     """
     from lio_jax.commands.evaluate import evaluate as command
@@ -163,7 +163,7 @@ def report(
     folders: Positional[Annotated[tuple[Path, ...], arg(metavar="DIR [DIR ...]")]],
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
 ) -> None:
-    """Draw a run's report anew, or compare several runs on one page.
+    """Draw a run's report again, or compare several runs on one page.
 
     Args:
         folders: Folders that lio-jax run wrote.
@@ -179,7 +179,7 @@ def view(
     folder: Positional[Annotated[Path, arg(metavar="DIR")]],
     web: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> None:
-    """Open a run's recording: clouds, map, trajectory and what the estimator knew, over time.
+    """Open a run's recording: clouds, map, trajectory and the estimator's state, over time.
 
     Args:
         folder: Folder that lio-jax run wrote, or an .rrd.
@@ -205,12 +205,12 @@ def export(
 
     Args:
         data: Recording: KITTI folder, ROS bag or native folder.
-        to: Format.
-        out: What to write: *.bag (ROS 1), *.mcap or *.db3 (ROS 2); else a folder.
+        to: Output format.
+        out: Output: *.bag (ROS 1), *.mcap or *.db3 (ROS 2); else a folder.
         layout: Make of the LiDAR whose messages a bag gets: velodyne, ouster or livox.
         start: First scan.
-        scans: How many scans; None means all.
-        overwrite: Replace the recording that is there.
+        scans: Number of scans; None means all.
+        overwrite: Replace an existing recording.
     """
     from lio_jax.commands.export import export as command
 
@@ -225,14 +225,14 @@ def map_(
     part: Literal["whole", "corner", "surface"] = "whole",
     overwrite: Overwrite = False,
 ) -> None:
-    """Save the map of a run at any resolution, as PCD or PLY.
+    """Write the map of a run at a chosen resolution, as PCD or PLY.
 
     Args:
         folder: Folder that lio-jax run wrote.
-        out: What to write: *.pcd or *.ply.
-        voxel: One point is kept per cube of this edge, m.
-        part: All points, or corners or surfaces alone, where the recipe tells them apart.
-        overwrite: Replace the file that is there.
+        out: Output: *.pcd or *.ply.
+        voxel: Edge of the cubes of which each gives one point, m.
+        part: All points, or only corners or only surfaces, where the recipe separates them.
+        overwrite: Replace an existing file.
     """
     from lio_jax.commands.map import make_map
 
@@ -259,25 +259,25 @@ def tune(
     seed: Annotated[int, arg(metavar="K")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Tune parameters by gradient; with the objective noise no ground truth is needed.
+    """Tune parameters by gradient; the objective noise needs no ground truth.
 
     Args:
         data: Recordings to tune on.
-        params: Parameters, such as imu.gyro_noise,imu.accel_noise or extrinsics.*.
-        out: Folder for tuned.yaml, history.json and tuning.png; an earlier tuning there is gone on with.
+        params: Parameters, for example imu.gyro_noise,imu.accel_noise or extrinsics.*.
+        out: Folder for tuned.yaml, history.json and tuning.png; an earlier tuning there is continued.
         objective: noise, pose, point, planes, marginal (lio_sam), map, ate, rpe, rpe-rotation, or a sum
-            such as ate+0.01*pose.
+            for example ate+0.01*pose.
         recipe: Recipe or settings file to start from; None as for run.
         validate: Recordings that decide which iterate is taken and when to stop.
         gt: Ground truth of T_world_imu; None means the recordings' own.
         optimizer: auto takes scoring for likelihoods and lbfgsb for the others; adam steps on segments.
-        iterations: Evaluations at most.
-        patience: Evaluations without a better one before the tuning ends.
+        iterations: Largest number of evaluations.
+        patience: Number of evaluations without a better one after which the tuning ends.
         start: First scan.
-        scans: How many scans of each recording; None means all.
-        segment: Cut recordings into pieces of this many scans, each with a start of its own.
-        seed: Of the segments that adam draws.
-        overwrite: Begin anew where an earlier tuning is in the folder.
+        scans: Number of scans of each recording; None means all.
+        segment: Cut recordings into segments of this many scans; each starts on its own.
+        seed: Seed of the segments that adam draws.
+        overwrite: Start again if the folder holds an earlier tuning.
     """
     from lio_jax.commands.runtime import prepare_jax
     from lio_jax.commands.tune import TuneOptions
@@ -310,14 +310,14 @@ def ablate(
     report: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     retry_failed: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> None:
-    """Compare settings over recordings and seeds; the same command goes on where it ended.
+    """Compare settings over recordings and seeds; the same command continues an interrupted one.
 
     Args:
         spec: Recordings, settings to compare and metrics; configs/ablations/ has examples.
-        out: Folder for the runs, the table and the report; what is done there is not done again.
-        scheduler: Running dask scheduler; left out, workers are started on this machine.
+        out: Folder for the runs, the table and the report; finished runs in it are not repeated.
+        scheduler: Running dask scheduler; without it, workers are started on this machine.
         report: Write report.html: ranking, pictures, failures.
-        retry_failed: Try runs again that failed before.
+        retry_failed: Try failed runs again.
     """
     from lio_jax.commands.ablate import ablate as command
 
@@ -334,8 +334,8 @@ def optimize_graph(
     """Find the poses that agree best with all edges of a pose graph.
 
     Args:
-        graph: Pose graph, in space or in the plane; needs edges only, and may have vertices and FIX lines.
-        out: The same graph with the poses found.
+        graph: Pose graph, in 3D or in the plane; it needs edges, and may have vertices and FIX lines.
+        out: Output: the graph with the poses of the solution.
         robust: Distrust loops that contradict the rest.
         json: Print one JSON object instead of a table.
     """
@@ -353,13 +353,13 @@ def calibrate_imu(
     plot: Annotated[Path | None, arg(metavar="FILE.png")] = None,
     skip: Annotated[float, arg(metavar="SEC")] = 0.0,
 ) -> None:
-    """Find an IMU's noise densities in a recording of it at rest, by its Allan deviation.
+    """Find an IMU's noise densities from a recording at rest, by its Allan deviation.
 
     Args:
         data: Recording at rest, or the imu.npz of a native folder.
         out: Settings file for --recipe.
         plot: Picture of the Allan deviation.
-        skip: Leave out this much at the start, s.
+        skip: Time to leave out at the start, s.
     """
     from lio_jax.commands.calibrate_imu import calibrate_imu as command
 
@@ -378,7 +378,7 @@ def main(argv: list[str] | None = None) -> int:
     except SystemExit as leaving:
         return leaving.code if isinstance(leaving.code, int) else 2
     except BrokenPipeError:
-        # whoever read the output has seen enough; nothing may be left that flushes to the closed pipe at exit
+        # the reader of the output has closed the pipe; nothing may be left to be flushed to it at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (KeyboardInterrupt, Exception) as error:
@@ -407,12 +407,12 @@ def _sentence(error: BaseException) -> str:
 
 
 def _gathered(words: list[str]) -> list[str]:
-    """Move all ``--set`` assignments behind one ``--set`` at the end, so that it may be repeated anywhere.
+    """Move all ``--set`` assignments behind one ``--set`` at the end, so that the option may be repeated.
 
-    What follows ``--set`` is an assignment, and so is each further word of the form NAME=VALUE.
+    A word after ``--set`` is an assignment, and so is each further word of the form NAME=VALUE.
 
     Raises:
-        UsageError: a ``--set`` is followed by nothing.
+        UsageError: nothing follows a ``--set``.
     """
     rest: list[str] = []
     assignments: list[str] = []

@@ -51,7 +51,7 @@ FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__in
 
 
 def package_of(module: str) -> str:
-    """Return the floor-bearing part of a name such as lio_jax.run.track."""
+    """Return the part of a name that has a floor, for example of lio_jax.run.track."""
     parts = module.split(".")
     return parts[1] if len(parts) > 1 else ""
 

@@ -1,12 +1,12 @@
-"""What many parameter sets on one recording cost: one ablation against separate runs.
+"""Time of many parameter sets on one recording: one ablation against separate runs.
 
     python experiments/bench/ablation.py [--sets 64] [--separate 8] [--seconds 3] [--batch auto] [--json]
 
 A short simulated street (32 beams x 1024, inertial samples) is written once. The ablation is one
-``lio-jax ablate`` of all sets, its start and table included. Of the separate ``lio-jax run`` processes,
-without pictures, maps and recordings, a few are measured, as many at a time as there are cores, half of them
-before and half after it; their time is scaled up to as many as there are sets. Compiled programs are cached
-for both.
+``lio-jax ablate`` of all sets, including its start and table. Only a few of the separate ``lio-jax run``
+processes (without pictures, maps and recordings) are measured: as many at a time as there are cores, half of
+them before the ablation and half after it. Their time is scaled up to the number of sets. Compiled programs
+are cached for both.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def main() -> None:
             *("sim", "street", "--sensor", "generic32", "--seed", "1"),
             *("--duration", str(options.seconds), "--out", str(data)),
         )
-        # programs into the cache
+        # fill the cache of compiled programs
         _separate(data, sets[:1], work / "warm", cores)
         _ablation(data, sets[:2], work, "warm_ablation", options.batch)
         half = max(1, options.separate // 2)
@@ -79,7 +79,7 @@ def _options() -> argparse.Namespace:
 
 
 def _separate(data: Path, sets: list[float], out: Path, at_once: int) -> float:
-    """Return how long a run per set takes, s."""
+    """Return the time of one run for each set, s."""
 
     def one(number: int) -> None:
         words = ("--out", str(out / str(number)), "--set", f"{_PATH}={sets[number]}", *_QUIET)
@@ -92,7 +92,7 @@ def _separate(data: Path, sets: list[float], out: Path, at_once: int) -> float:
 
 
 def _ablation(data: Path, sets: list[float], work: Path, name: str, batch: str) -> float:
-    """Return how long the ablation of the sets takes, s."""
+    """Return the time of the ablation of all sets, s."""
     tree = {
         "sequences": [{"path": str(data)}],
         "grid": {_PATH: sets},

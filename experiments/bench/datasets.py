@@ -1,4 +1,4 @@
-"""The recordings a comparison runs on: decoded scans, and what is known to be true about them."""
+"""The recordings of a comparison: decoded scans and their references."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.data.trajectory import Trajectory
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
-"""Where real recordings lie beside a checkout, if there are any."""
+"""Folder of real recordings next to a checkout, if there are any."""
 
 REAL = {
     "kitti_odometry_04": SHARED / "kitti_odometry/sequences/04",
@@ -21,12 +21,12 @@ REAL = {
 }
 
 _STANDING_M = 1.0
-"""A drive whose reference covers less than this is scored as standing."""
+"""A drive whose reference covers less than this distance counts as standing, m."""
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """Scans in memory and their reference."""
+    """Scans in memory, and their reference."""
 
     name: str
     scans: list[LidarScan]
@@ -38,9 +38,9 @@ def recorded(path: Path, name: str | None, start: int, count: int | None) -> Dat
     """Open a recording of any known format and decode its scans.
 
     Args:
-        path: as ``lio_jax.data.open_sequence`` takes it.
-        name: for the table; None: the recording's own.
-        start: first scan.
+        path: path as for ``lio_jax.data.open_sequence``.
+        name: name for the table; None: the recording's own.
+        start: index of the first scan.
         count: number of scans; None: all.
     """
     from lio_jax.data.config import DataConfig

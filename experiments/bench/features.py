@@ -1,10 +1,10 @@
-"""What the feature front ends of LOAM and LIO-SAM cost: median and 95 % of the time per scan, ms.
+"""Time of the feature front ends of LOAM and LIO-SAM: median and 95 % of the time per scan, ms.
 
     python experiments/bench/features.py [--repeats 100] [--threads 2] [--json]
 
-Scans are simulated; a real HDL-64E scan is added where the recordings lie beside the checkout. They are on
+Scans are simulated; a real HDL-64E scan is added if the recordings are next to the checkout. The scans are on
 the device already, each program has run before, and the programs take turns. "image" is the range image,
-"rings" ends with smoothness and masks, "features" is the whole.
+"rings" ends with smoothness and masks, "features" is the whole front end.
 """
 
 import argparse
@@ -26,7 +26,7 @@ SENSORS = {"hdl64": (64, 2304, 1800), "generic32": (32, 1024, 1024), "vlp16": (1
 def main() -> None:
     """Measure and print the table."""
     options = _options()
-    # before anything starts threads: this is what limits XLA
+    # before any thread starts: this limits XLA
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: options.threads])
     rows = []
     for name, (scan, sizes) in _scans().items():
@@ -70,7 +70,7 @@ def _scans() -> "dict[str, tuple[LidarScan, tuple[int, int, int]]]":
 
 
 def _programs(scan: "LidarScan", sizes: tuple[int, int, int]) -> dict[str, dict[str, Callable[[], Any]]]:
-    """Return each recipe's programs, compiled, from the first stage to the whole."""
+    """Return each recipe's compiled programs, from the first stage to the whole front end."""
     from functools import partial
 
     import jax

@@ -2,7 +2,7 @@
 
     python experiments/bench/flat_over_time.py [--scans 2000] [--json]
 
-The scans are simulated while they are tracked, so nothing but the estimator itself can accumulate.
+The scans are simulated while they are tracked, so only the estimator itself can accumulate memory.
 """
 
 import argparse

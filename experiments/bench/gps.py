@@ -1,10 +1,10 @@
-"""A drifting odometry tied to GPS fixes, with an outage, on a simulated loop of 1.1 km driven twice.
+"""A drifting odometry corrected by GPS fixes, with an outage, on a simulated loop of 1.1 km driven twice.
 
     python experiments/bench/gps.py [--seeds 0 1 2] [--outage 60] [--json]
 
-Fixes come five times a second with white noise of 0.3 m (0.6 m up), which they state, and slow errors of
-0.5 m (1 m up) that last 30 s, which they do not. Neither heading nor place of the odometry on the earth is
-known. "ATE" is after the best rigid alignment; "on earth" is the distance from the truth as it stands.
+Fixes come five times a second with white noise of 0.3 m (0.6 m up), which they report, and slow errors of
+0.5 m (1 m up) that last 30 s, which they do not report. Heading and place of the odometry on the earth are
+unknown. "ATE" is the error after the best rigid alignment; "on earth" is the error without an alignment.
 """
 
 import argparse
@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 RATE, SPEED = 5.0, 8.0
 WHITE, SLOW, LASTS = np.array([0.3, 0.3, 0.6]), np.array([0.5, 0.5, 1.0]), 30.0
 HEADING = 2.0
-"""Of the odometry's world on the earth, rad."""
+"""Heading of the odometry's world on the earth, rad."""
 _COVARIANCE = np.diag([1e-3**2] * 3 + [1e-2**2] * 3)
 
 
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def measured(seed: int, outage: float) -> dict[str, Any]:
-    """Return what the table shows of a seed."""
+    """Return the figures of the table for one seed."""
     from loops import absolute_error, lap_twice
     from simulated_keyframes import drifted, times_along
 
@@ -95,7 +95,7 @@ def measured(seed: int, outage: float) -> dict[str, Any]:
 
 
 def fixes(truth: np.ndarray, seconds: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return times and positions (n, 3) of the fixes, in a frame that is turned by ``HEADING``."""
+    """Return times (s) and positions (n, 3), m, of the fixes, in a frame that is turned by ``HEADING``."""
     rng = np.random.default_rng(seed)
     times = np.arange(0.0, seconds[-1], 1 / RATE)
     position = np.stack([np.interp(times, seconds, axis) for axis in truth[:, :3, 3].T], -1)

@@ -1,4 +1,4 @@
-"""What a gradient costs beside the plain run: time per scan, and memory over the recording's length.
+"""Cost of a gradient compared with the plain run: time per scan, and memory over the recording's length.
 
 python experiments/bench/gradient_cost.py [--scans N] [--memory] [--json]
 """
@@ -46,7 +46,7 @@ def main() -> None:
 
 
 def measured(scans: int) -> dict[str, float]:
-    """Return the medians per scan of both, in one process."""
+    """Return the median times per scan of both, measured in one process."""
     from lio_jax import ImuModel, SimulatedSequence
     from lio_jax.run.run import peak_rss_mb, settings_for
     from lio_jax.run.track import CompiledStep, run_steps
@@ -57,7 +57,7 @@ def measured(scans: int) -> dict[str, float]:
     from lio_jax.tuning.streaming import StreamingGradient
 
     class TimedRecording(Recording):
-        """Notes how long each scan's user takes until it asks for the next one."""
+        """Record the time between the return of each scan and the request for the next one."""
 
         def scan_inputs(self):
             self.ms = []

@@ -1,4 +1,4 @@
-"""The same chain of states and measurements as a factor graph of gtsam."""
+"""The chain of states and measurements of a recording as a factor graph of gtsam."""
 
 import gtsam
 import numpy as np
@@ -10,7 +10,7 @@ from lio_jax.estimation.motion_state import MotionState
 from lio_jax.imu.params import ImuParams
 
 ORDER = [*range(9), 12, 13, 14, 9, 10, 11]
-"""gtsam has the accelerometer's bias before the gyroscope's."""
+"""Order of gtsam's state: the accelerometer's bias comes before the gyroscope's."""
 
 
 class GtsamChain:
@@ -61,7 +61,7 @@ class GtsamChain:
         values.insert(B(k), gtsam.imuBias.ConstantBias(accel_bias, gyro_bias))
 
     def factors(self, k: int) -> list[gtsam.NonlinearFactor]:
-        """Return what state ``k`` adds: its own measurements and the link that leads to it."""
+        """Return the factors that state ``k`` adds: its own measurements and the link that leads to it."""
         chain, noise = self.chain, gtsam.noiseModel.Gaussian
         model = noise.Information(self.information[k])
         found = [gtsam.PriorFactorPose3(X(k), gtsam.Pose3(self.poses[k]), model)]
@@ -70,7 +70,7 @@ class GtsamChain:
         else:
             keys = (X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k))
             link = gtsam.GalileanCombinedImuFactor(*keys, self.links[k - 1])
-            # ours, because gtsam has the sign of drift against motion the other way round
+            # ours, because gtsam has the opposite sign of the correlation between drift and motion
             found.append(link.cloneWithNewNoiseModel(noise.Covariance(self.covariance[k - 1])))
         relative, gps = chain.relative, chain.gps
         if relative is not None and k > 0:
@@ -93,7 +93,7 @@ class GtsamChain:
         pose = gtsam.Pose3(np.asarray(prior.origin.T_world_imu.as_matrix()))
 
         def error(factor: gtsam.CustomFactor, values: gtsam.Values, H: list[np.ndarray]) -> np.ndarray:
-            # rotation and position apart, where PriorFactorPose3 takes the logarithm of the whole pose
+            # rotation and position separately; PriorFactorPose3 takes the logarithm of the whole pose
             missed = pose.between(values.atPose3(X(0)))
             turn = gtsam.Rot3.Logmap(missed.rotation())
             if H is not None:
@@ -128,7 +128,7 @@ def states_of(values: gtsam.Values, numbers: range) -> list[np.ndarray]:
 
 
 def covariance_of(marginals: gtsam.Marginals, pose: gtsam.Pose3, k: int) -> np.ndarray:
-    """Return the covariance of a state's error in our order; gtsam's velocity is perturbed in world axes."""
+    """Return the covariance of a state's error in our order; gtsam perturbs the velocity in world axes."""
     keys = (X(k), V(k), B(k))
     joint = marginals.jointMarginalCovariance(gtsam.KeyVector(keys))
     matrix = np.block([[joint.at(row, column) for column in keys] for row in keys])

@@ -1,4 +1,4 @@
-"""LiDAR-inertial peers behind the comparison's protocol, with the settings their authors recommend."""
+"""LiDAR-inertial peers behind the comparison's protocol, with the settings that their authors recommend."""
 
 from collections.abc import Iterator
 from typing import Any, ClassVar, NamedTuple
@@ -20,18 +20,18 @@ class Rig(NamedTuple):
     min_range: float
     max_range: float
     noise: dict[str, float]
-    """gyro_noise, accel_noise, gyro_bias_walk, accel_bias_walk: densities."""
+    """Densities by name: gyro_noise, accel_noise, gyro_bias_walk, accel_bias_walk."""
     starts_at_rest: bool
 
 
 class _ImuReader:
-    """Hands out inertial samples in time order, each once."""
+    """Return inertial samples in time order, each once."""
 
     def __init__(self, imu: ImuData) -> None:
         self._imu, self._next = imu, 0
 
     def until(self, stamp_ns: int) -> Iterator[tuple[int, NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield (stamp, gyro, accel) up to and without ``stamp_ns``."""
+        """Yield (stamp, gyro, accel) of the samples before ``stamp_ns``."""
         stop = int(np.searchsorted(self._imu.stamp_ns, stamp_ns))
         for row in range(self._next, stop):
             yield int(self._imu.stamp_ns[row]), self._imu.gyro[row], self._imu.accel[row]
@@ -39,7 +39,7 @@ class _ImuReader:
 
 
 class RkoLio:
-    """RKO-LIO with its defaults, the IMU as its base frame."""
+    """RKO-LIO with its defaults; the IMU is its base frame."""
 
     name: ClassVar[str] = "rko-lio"
     instant: ClassVar[float] = 1.0
@@ -49,9 +49,9 @@ class RkoLio:
         from rko_lio.config import LIOConfig
         from rko_lio.lio import LIO
 
-        # the phase takes the first scans as standing still: it helps that start and spoils a moving one
+        # this phase assumes that the vehicle stands still: it helps such a start and harms a moving one
         config = LIOConfig(max_num_threads=threads, initialization_phase=rig.starts_at_rest)
-        # below the Python wrapper: that one copies the scan once more on each call
+        # below the Python wrapper, which copies the scan once more on each call
         self._lio = LIO(config)._impl
         self._extrinsic = rig.T_imu_lidar
         self._imu = _ImuReader(rig.imu)
@@ -78,22 +78,22 @@ class RkoLio:
 
 
 class EvalioPipeline:
-    """One of the systems that evalio ships."""
+    """One of the systems that evalio contains."""
 
     name: ClassVar[str]
     instant: ClassVar[float]
     instant_reason: ClassVar[str]
     pipeline: ClassVar[str]
-    """Class in evalio.pipelines."""
+    """Name of the class in evalio.pipelines."""
     behind: ClassVar[int] = 0
-    """How many scans later than its own a pose comes out; evalio stamps it with the scan that went in."""
+    """Number of scans by which a pose is delayed; evalio stamps it with the newest scan."""
 
     def __init__(self, threads: int, rig: Rig) -> None:
         from evalio import pipelines
         from evalio.types import SE3, SO3, ImuParams, LidarParams
 
         self.estimates: list[tuple[int, Pose]] = []
-        """Start of the scan a pose belongs to, and the pose; whoever takes them clears the list."""
+        """Start of the scan to which a pose belongs, and the pose; the reader of the list clears it."""
         self._scans_ns: list[int] = []
         self._pose: Pose = rig.T_imu_lidar
         self._rig, self._imu = rig, _ImuReader(rig.imu)
@@ -123,7 +123,7 @@ class EvalioPipeline:
         self._pipeline.initialize()
 
     def settings(self, threads: int, rig: Rig) -> dict[str, bool | int | float | str]:
-        """Return what is set beside the defaults."""
+        """Return the settings that differ from the defaults."""
         return {}
 
     def warm_up(self, scans: list[LidarScan]) -> None:
@@ -166,7 +166,7 @@ class LioSam(EvalioPipeline):
     behind: ClassVar[int] = 2
 
     def settings(self, threads: int, rig: Rig) -> dict[str, bool | int | float | str]:
-        # by default it maps every second scan and has no pose for the others
+        # by default it maps every second scan, and gives no pose for the others
         return {"numberOfCores": threads, "mappingProcessInterval": 0.0}
 
 
@@ -190,12 +190,12 @@ class Dlio(EvalioPipeline):
     pipeline: ClassVar[str] = "DLIO"
 
     def settings(self, threads: int, rig: Rig) -> dict[str, bool | int | float | str]:
-        # its 3 s of calibration would reach into the motion
+        # its 3 s of calibration would include motion
         return {"imu_calibrate": rig.starts_at_rest, "imu_calib_time": 1.0}
 
 
 def _measurement(scan: LidarScan, rig: Rig) -> Any:
-    """Return the scan as evalio wants it, each ray in the column it was fired in."""
+    """Return the scan in evalio's form, with each ray in the column in which it was fired."""
     # float32 seconds: half a microsecond keeps a ray in its column
     column = np.floor((scan.time.astype(np.float64) + 5e-7) / (scan.duration / rig.columns)).astype(np.intp)
     return measurement(scan, column, np.ones(len(column), bool), rig.beams, rig.columns)
@@ -204,14 +204,14 @@ def _measurement(scan: LidarScan, rig: Rig) -> Any:
 def measurement(
     scan: LidarScan, column: NDArray[np.intp], kept: NDArray[np.bool_], beams: int, columns: int
 ) -> Any:
-    """Return the scan as evalio wants it: row by row, rays without a return as zeros.
+    """Return the scan in evalio's form: row by row, rays without a return as zeros.
 
     Args:
-        scan: as recorded.
-        column: of each point; those beyond the last one fall into it.
-        kept: which points are handed on.
-        beams: rows.
-        columns: of a row.
+        scan: the scan as recorded.
+        column: column of each point; points beyond the last column are put into it.
+        kept: which points are passed on.
+        beams: number of rows.
+        columns: number of columns in a row.
     """
     from evalio._cpp.helpers import (
         DataType,
@@ -257,4 +257,4 @@ def measurement(
 
 
 INERTIAL_PEERS = {system.name: system for system in (RkoLio, LioSam, Loam, Dlio)}
-"""Name to class: ``class(threads, rig)``."""
+"""Classes by name: ``class(threads, rig)``."""

@@ -1,4 +1,4 @@
-"""Run several systems over the same scans so that a noisy machine's ups and downs hit all of them alike."""
+"""Run several systems over the same scans in turns, so that a noisy machine affects all of them equally."""
 
 import gc
 import time
@@ -10,17 +10,17 @@ from datasets import Dataset
 from systems import Pose, System
 
 _PAUSE_S = 0.005
-"""Before each timed call: lets the thread pool of the system that ran before stop spinning."""
+"""Pause before each timed call, s: the thread pool of the previous system can stop spinning."""
 
 
 @dataclass
 class Record:
-    """What one system did on one dataset."""
+    """The results of one system on one dataset."""
 
     milliseconds: list[list[float]] = field(default_factory=list)
-    """Per pass, per scan."""
+    """Times per pass and per scan, ms."""
     poses: list[list[Pose]] = field(default_factory=list)
-    """Per pass, T_world_lidar per scan."""
+    """T_world_lidar per pass and per scan."""
 
 
 def run(
@@ -30,12 +30,13 @@ def run(
 
     Args:
         dataset: decoded scans.
-        factories: name to maker of a fresh system.
-        repeats: passes.
-        by_scan: take turns scan by scan, else pass by pass; who begins rotates either way.
+        factories: makers of a new system, by name.
+        repeats: number of passes.
+        by_scan: whether systems take turns scan by scan, else pass by pass; the first one rotates in both
+            cases.
 
     Returns:
-        Times and poses per system; what is done only once (compilation) is not in the times.
+        Times and poses of each system; work that is done once (compilation) is not in the times.
     """
     records = {name: Record() for name in factories}
     for factory in factories.values():

@@ -1,4 +1,4 @@
-"""Run every system in a process of its own, taking turns scan by scan: crashes and memory stay apart."""
+"""Run every system in a process of its own, in turns scan by scan, to separate crashes and memory."""
 
 import importlib
 import multiprocessing
@@ -18,32 +18,32 @@ from lio_jax.data.sequence import LidarScan
 from lio_jax.data.trajectory import Trajectory
 
 _PAUSE_S = 0.005
-"""Before each timed call: lets the thread pool of the system that ran before stop spinning."""
+"""Pause before each timed call, s: the thread pool of the previous system can stop spinning."""
 
 _DEADLINE_S = 300.0
-"""For one scan, and for start and compilation; a system that takes longer counts as hung."""
+"""Time limit for one scan, and for start and compilation, s; a slower system counts as hung."""
 
 
 @dataclass
 class Outcome:
-    """What one system did on one recording."""
+    """The results of one system on one recording."""
 
     milliseconds: list[float] = field(default_factory=list)
-    """Per scan, wall clock."""
+    """Wall-clock time of each scan, ms."""
     cpu_milliseconds: list[float] = field(default_factory=list)
-    """Per scan, of all the process's threads: what other work on the machine does not change."""
+    """CPU time of each scan over all the process's threads, ms; other work on the machine does not count."""
     scan_stamp_ns: list[int] = field(default_factory=list)
-    """Of each pose: the start of the scan it belongs to."""
+    """Start of the scan to which each pose belongs, ns."""
     poses: list[Pose] = field(default_factory=list)
-    """T_world_lidar."""
+    """T_world_lidar of each pose."""
     failures: list[str] = field(default_factory=list)
     """One sentence for each scan that failed."""
     died: str = ""
-    """Why there are no results from some scan on, or nothing."""
+    """Why there are no results after some scan; "" if there are."""
     idle_mb: float = 0.0
-    """Peak memory before the system is built: interpreter and this script."""
+    """Peak memory before the system is built, MiB: interpreter and this script."""
     peak_mb: float = 0.0
-    """Peak memory at the end."""
+    """Peak memory at the end, MiB."""
 
     def trajectory(self, offset_ns: int) -> Trajectory:
         """Return the poses, stamped ``offset_ns`` after the starts of their scans."""
@@ -52,7 +52,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Maker:
-    """How a worker makes a fresh system: ``module.function(*arguments, recording)``."""
+    """How a worker makes a new system: ``module.function(*arguments, recording)``."""
 
     module: str
     function: str
@@ -67,12 +67,12 @@ class Maker:
 
 
 def run(recording: Path, makers: dict[str, Maker], say: Callable[[str], None]) -> dict[str, Outcome]:
-    """Run every system once over a native folder; who begins rotates from scan to scan.
+    """Run every system once over a native folder; the first system rotates from scan to scan.
 
     Args:
-        recording: native folder.
-        makers: name to maker.
-        say: told in one line of each system that ends early.
+        recording: path of the native folder.
+        makers: makers by name.
+        say: function that takes one line about each system that ends early.
     """
     outcomes = {name: Outcome() for name in makers}
     workers = {name: _Worker(maker, recording) for name, maker in makers.items()}
@@ -96,7 +96,7 @@ def run(recording: Path, makers: dict[str, Maker], say: Callable[[str], None]) -
 
 
 class _Worker:
-    """The parent's end of one process."""
+    """The parent's side of one process."""
 
     def __init__(self, maker: Maker, recording: Path) -> None:
         # spawned: a forked child would inherit this process's JAX and its threads
@@ -115,7 +115,7 @@ class _Worker:
         return answer
 
     def stop(self) -> str:
-        """End the process and return how it ended."""
+        """End the process and return the way in which it ended."""
         self.connection.close()
         self._process.join(2)
         if self._process.is_alive():
@@ -166,7 +166,7 @@ def _where(request: int | str) -> str:
 
 def _serve(maker: Maker, recording: Path, connection: Connection) -> None:
     """Answer the parent's requests until it closes the connection."""
-    # what peers print is not the table
+    # the output of peers must not mix with the table
     quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 1)
     os.dup2(quiet, 2)
@@ -178,13 +178,13 @@ def _serve(maker: Maker, recording: Path, connection: Connection) -> None:
             return
         try:
             answer = side.answer(request)
-        except Exception as error:  # a peer may raise anything; the parent names it
+        except Exception as error:  # a peer may raise any exception; the parent reports it
             answer = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
         connection.send(answer)
 
 
 class _Side:
-    """The worker's own state."""
+    """The worker's side of one process."""
 
     def __init__(self, maker: Maker, recording: Path) -> None:
         from lio_jax.data.config import DataConfig
@@ -196,7 +196,7 @@ class _Side:
         self._idle_mb = 0.0
 
     def answer(self, request: int | str) -> dict[str, Any]:
-        """Return what the parent asked for."""
+        """Return the answer to a request of the parent."""
         if request == "start":
             self._idle_mb = _peak_mb()
             for first in self._typical():
@@ -209,7 +209,7 @@ class _Side:
         return self._register(next(self._sequence.scans(request, 1)))
 
     def _typical(self) -> list[int]:
-        """Return where to warm up: at the start, and at the smallest and the largest scan."""
+        """Return the scans for a warm-up: the first, the smallest and the largest."""
         sizes = [len(scan.points) for scan in self._sequence.scans()]
         last = max(0, len(sizes) - 3)
         return sorted({0, min(int(np.argmin(sizes)), last), min(int(np.argmax(sizes)), last)})
@@ -221,7 +221,7 @@ class _Side:
         pose = self._system.register(prepared)
         spent, cpu = time.perf_counter() - begin, time.process_time() - cpu
         estimates: list[tuple[int, NDArray[np.float64]]] = [(scan.stamp_ns, np.array(pose, np.float64))]
-        # a system that answers late, or not for each scan, says which scans its poses belong to
+        # a system that answers late, or not for each scan, states the scans of its poses
         own = getattr(self._system, "estimates", None)
         if own is not None:
             estimates = list(own)
@@ -231,7 +231,7 @@ class _Side:
 
 def _peak_mb() -> float:
     """Return this process's largest resident memory, MiB."""
-    # not getrusage: a spawned process's begins with its parent's
+    # not getrusage: its value for a spawned process starts with the parent's
     status = Path("/proc/self/status").read_text()
     line = next(line for line in status.splitlines() if line.startswith("VmHWM"))
     return int(line.split()[1]) / 1024

@@ -2,8 +2,8 @@
 
     python experiments/bench/lidar_vs_peers.py [--kitti-odometry DIR] [--kitti-raw DIR] [--json]
 
-Without a recording: the real ones beside the checkout (../shared/data) if they are there, else a simulated
-street. Needs ``pip install lio-jax[bench]``.
+Without a recording it takes the real ones next to the checkout (../shared/data), or a simulated street if
+there are none. Needs ``pip install lio-jax[bench]``.
 """
 
 import argparse
@@ -29,7 +29,7 @@ PEER_NAMES = ("kiss-icp", "small_gicp", "kiss-icp-no-deskew", "evalio-loam")
 def main() -> None:
     """Run the comparison and print it."""
     options = _options()
-    # before anything starts threads: this is what limits XLA, and it holds for every system alike
+    # before any thread starts: this limits XLA, and holds equally for every system
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: options.threads])
     os.environ["OMP_NUM_THREADS"] = str(options.threads)
     from interleaved import run

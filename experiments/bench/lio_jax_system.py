@@ -17,11 +17,11 @@ from lio_jax.run.track import CompiledStep, track
 from lio_jax.settings.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 
 _OPENING = 3
-"""Scans in which every program of a drive has been compiled once: init, restart, step."""
+"""Number of scans in which every program of a drive is compiled: init, restart, step."""
 
 
 class LioJaxSystem:
-    """A recipe; padding, transfer, the step and the result's way back to the host are timed."""
+    """A recipe; padding, transfer, the step and the return of the result to the host are timed."""
 
     name: ClassVar[str] = "lio_jax"
     instant: ClassVar[float] = 1.0
@@ -35,16 +35,16 @@ class LioJaxSystem:
         inertial: Sequence | None = None,
         recipe: str = "default",
     ) -> None:
-        """Make a system that has seen no scan.
+        """Make a system without any scan.
 
         Args:
-            threads: for the interface's sake.
-            T_imu_lidar: (4, 4).
-            overrides: ``path=value`` settings.
-            inertial: recording whose inertial samples to use; None: LiDAR only.
-            recipe: its own settings hold where ``overrides`` say nothing.
+            threads: not used here; part of the interface.
+            T_imu_lidar: (4, 4) pose of the lidar in the IMU frame.
+            overrides: settings as ``path=value``.
+            inertial: recording with the inertial samples to use; None: LiDAR only.
+            recipe: recipe whose settings apply unless ``overrides`` replaces them.
         """
-        # XLA takes the cores that the process may run on: the script limits those to ``threads``
+        # XLA takes the cores on which the process may run: the script limits those to ``threads``
         jax.config.update("jax_enable_x64", True)
         self._T_imu_lidar = T_imu_lidar
         settings, step = _compiled(T_imu_lidar.tobytes(), recipe, overrides)
@@ -75,7 +75,7 @@ class LioJaxSystem:
 
 
 def sizes_for(recipe: str, scans: list[LidarScan]) -> tuple[str, ...]:
-    """Return the sizes that the scans decide where a recipe leaves them open, as overrides."""
+    """Return as overrides the sizes that a recipe leaves open and the scans determine."""
     settings = recipe_settings(recipe)
     fitting = with_sensor_sizes(settings, scans)[0].config.features
     return tuple(
@@ -87,7 +87,7 @@ def sizes_for(recipe: str, scans: list[LidarScan]) -> tuple[str, ...]:
 
 @cache
 def _compiled(T_imu_lidar: bytes, recipe: str, overrides: tuple[str, ...]) -> tuple[Settings, CompiledStep]:
-    """Return settings and the step that every pass over a recording shares, so that it is compiled once."""
+    """Return settings and the step that all passes over a recording share, so that it is compiled once."""
     matrix = np.frombuffer(T_imu_lidar, np.float64).reshape(4, 4)
     settings = with_overrides(with_extrinsics(recipe_settings(recipe), matrix, "recording"), overrides)
     return settings, CompiledStep(settings)

@@ -1,4 +1,4 @@
-"""Build the systems of the LiDAR-inertial comparison from a simulated recording, in whichever process."""
+"""Build the systems of the LiDAR-inertial comparison from a simulated recording, in any process."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ def our_maker(recipe: str, overrides: tuple[str, ...], threads: int) -> Maker:
 
 
 def instant_of(name: str) -> tuple[float, str]:
-    """Return which instant of a scan a system's poses refer to (0 start, 1 end), and why."""
+    """Return the instant of a scan to which a system's poses refer (0 start, 1 end), and the reason."""
     if name not in PEER_NAMES:
         return 1.0, "states live at the scan's end"
     system = PEERS[name] if name in PEERS else INERTIAL_PEERS[name]
@@ -34,7 +34,7 @@ def instant_of(name: str) -> tuple[float, str]:
 
 
 def peer(name: str, threads: int, recording: Path) -> System:
-    """Return a fresh peer."""
+    """Return a new instance of a peer."""
     if name in PEERS:
         return PEERS[name](threads)
     system: System = INERTIAL_PEERS[name](threads, _rig(recording))
@@ -42,7 +42,7 @@ def peer(name: str, threads: int, recording: Path) -> System:
 
 
 def ours(recipe: str, overrides: tuple[str, ...], threads: int, recording: Path) -> System:
-    """Return one of our recipes, fresh."""
+    """Return a new instance of one of our recipes."""
     from lio_jax_system import LioJaxSystem, sizes_for
 
     sequence = NativeSequence(recording, DataConfig())

@@ -1,4 +1,4 @@
-"""Simulated LiDAR-inertial recordings, written once as native folders that every system reads alike."""
+"""Simulated LiDAR-inertial recordings, written once as native folders that every system reads."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,8 +9,11 @@ import numpy as np
 from lio_jax.data.trajectory import Trajectory
 
 Motion = Literal["driven", "moving_start", "fast_rotation"]
-"""driven: the world's own body, at rest first; moving_start: at full speed from the start; fast_rotation: a
-hand that looks around at up to 4 rad/s."""
+"""Kind of motion.
+
+driven: the world's own body, first at rest; moving_start: at full speed from the start; fast_rotation: a hand
+that looks around at up to 4 rad/s.
+"""
 
 STANDSTILL_S = 2.0
 SWING_RATE = 4.0
@@ -19,7 +22,7 @@ _POSE_STEP_S = 0.01
 
 @dataclass(frozen=True)
 class Recording:
-    """What determines one simulated recording."""
+    """The arguments that determine one simulated recording."""
 
     world: str
     sensor: str
@@ -34,12 +37,12 @@ class Recording:
 
     @property
     def name(self) -> str:
-        """Name of table and folder."""
+        """Name of its table and of its folder."""
         return f"{self.group}_{self.seconds:g}s_seed{self.seed}"
 
     @property
     def starts_at_rest(self) -> bool:
-        """Whether the body stands still at first, which some systems have to be told."""
+        """Whether the body is at rest first; some systems need to know this."""
         return self.motion != "moving_start"
 
 
@@ -48,11 +51,11 @@ SPECIAL: dict[str, tuple[str, str, Motion]] = {
     "drone": ("field", "generic32", "driven"),
     "moving_start": ("street", "generic32", "moving_start"),
 }
-"""Name to world, sensor and motion of the recordings that try a system's robustness."""
+"""World, sensor and motion, by name, of recordings that test a system's robustness."""
 
 
 def written(recording: Recording, folder: Path) -> Path:
-    """Return the recording's native folder, simulating it if it is not there yet."""
+    """Return the recording's native folder; simulate it if it does not exist yet."""
     from lio_jax.data.native_writer import write_native
     from lio_jax.sim.imu import ImuModel
     from lio_jax.sim.sequence import SimulatedSequence

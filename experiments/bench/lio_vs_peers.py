@@ -1,10 +1,10 @@
-"""Compare our LiDAR-inertial recipes with the field's: time, error, memory and loss of track, in one run.
+"""Compare our LiDAR-inertial recipes with others: time, error, memory and loss of track, in one run.
 
     python experiments/bench/lio_vs_peers.py [--worlds street city] [--sensors generic32 os1_128]
         [--seeds 0 1 2] [--seconds 40] [--special fast_rotation drone moving_start] [--systems ...] [--json]
 
-Every system runs in a process of its own on simulated recordings, taking turns scan by scan. Decoding is not
-timed; padding, transfer and the pose's way back are. Needs ``pip install lio-jax[bench]``.
+Every system runs in a separate process on simulated recordings, in turns scan by scan. Decoding is not timed;
+padding, transfer and the return of the pose are. Needs ``pip install lio-jax[bench]``.
 """
 
 import argparse
@@ -39,13 +39,13 @@ _COLUMNS = {
     "time_ratio": "time/rko",
     "ate_ratio": "ATE/rko",
 }
-"""Key to heading."""
+"""Headings of the table by key."""
 
 
 def main() -> None:
     """Run the comparison and print it."""
     options = _options()
-    # before anything starts threads: workers inherit both, so that they hold for every system alike
+    # before any thread starts: workers inherit both, so they hold equally for every system
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: options.threads])
     os.environ["OMP_NUM_THREADS"] = str(options.threads)
     from isolated import run
@@ -171,7 +171,7 @@ def _errors(name: str, outcome: "Outcome", path: Path) -> dict[str, Any]:
         "ate_per_100m": 100 * errors["ate_m"] / length,
         "path_m": float(length),
         "lost_s": lost_after(estimate, reference.trajectory),
-        # the smallest should stand at 0: else the instant is taken wrongly
+        # the smallest error should be at 0: else the assumed instant is wrong
         "ate_shifted_m": {
             shift: score(outcome.trajectory(instant_ns + shift * 1_000_000), reference)["ate_m"]
             for shift in _SHIFTS_MS
@@ -180,7 +180,7 @@ def _errors(name: str, outcome: "Outcome", path: Path) -> dict[str, Any]:
 
 
 _FEWEST_POSES = 20
-"""Fewer poses than this are not scored."""
+"""A system with fewer poses than this gets no errors."""
 
 
 def _add_ratios(systems: dict[str, dict[str, Any]]) -> None:
@@ -192,7 +192,7 @@ def _add_ratios(systems: dict[str, dict[str, Any]]) -> None:
 
 
 def _means(runs: list[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
-    """Return the mean of every figure over the seeds that have it; the earliest loss of track; all deaths."""
+    """Return the mean of every figure over the seeds that have it, the earliest loss of track, all deaths."""
     means: dict[str, dict[str, Any]] = {}
     for name in runs[0]:
         means[name] = {"died": "; ".join(run[name]["died"] for run in runs if run[name]["died"])}

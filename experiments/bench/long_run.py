@@ -1,9 +1,9 @@
-"""A long drive with its back end beside it: is any scan delayed, and does memory grow but for keyframes?
+"""A long drive with its back end: is any scan delayed, and does memory grow more than the keyframes need?
 
     python experiments/bench/long_run.py [--world city] [--scans 36000] [--minutes 15] [--gps] [--json FILE]
 
-The scans of a VLP-16 are simulated while they are tracked; after so many minutes the run ends where it is. A
-scan's time is that of all stages after casting: padding, step, and handing over to the back end.
+The scans of a VLP-16 are simulated while they are tracked; after the given number of minutes the run ends. A
+scan's time is that of all stages after casting: padding, step, and the transfer to the back end.
 """
 
 import argparse
@@ -28,7 +28,7 @@ def main() -> None:
     parser.add_argument("--world", default="city")
     parser.add_argument("--scans", type=int, default=36_000)
     parser.add_argument("--minutes", type=float, default=15.0)
-    parser.add_argument("--gps", action="store_true", help="fixes with noise beside the loops")
+    parser.add_argument("--gps", action="store_true", help="use fixes with noise besides the loops")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     prepare_jax()
@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def driven(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the times, the memory and the errors of a drive."""
+    """Return times, memory and errors of a drive."""
     from lio_jax import GpsModel, ImuModel, SimulatedSequence
     from lio_jax.evaluation.evaluate import evaluate
     from lio_jax.run.run import run_sequence, settings_for

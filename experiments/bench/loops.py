@@ -1,10 +1,10 @@
-"""Loops that are found, missed and wrong on simulated drives whose odometry drifts more than is usual.
+"""Found, missed and wrong loops on simulated drives whose odometry drifts more than usual.
 
     python experiments/bench/loops.py [--only NAME ...] [--spacing M] [--json]
 
-A keyframe is a revisit if it is within 10 m of one that is more than 30 s older; it is recalled if a loop
-from it enters the graph. A loop is false if it is wrong by more than 1 m or 0.05 rad. Times are those of all
-that the back end does with a keyframe, the graph's solves included.
+A keyframe is a revisit if it is within 10 m of a keyframe that is more than 30 s older; it is recalled if a
+loop from it enters the graph. A loop is false if its error exceeds 1 m or 0.05 rad. Times are those of all
+work of the back end for a keyframe, including the solves of the graph.
 """
 
 import argparse
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _REVISIT, _TIME_GAP = 10.0, 30.0
 _FALSE = (1.0, 0.05)
 _LOOP = [(-1, -1), (3, -1), (3, 1), (1, 1), (1, 3), (-1, 3)]
-"""Crossings of the blocks' grid where the loop of 1.1 km turns."""
+"""Crossings of the blocks' grid at which the loop of 1.1 km turns."""
 
 Drive = tuple["list[Keyframe]", np.ndarray]
 """Keyframes and their true poses."""
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def measured(keyframes: "list[Keyframe]", truth: np.ndarray) -> dict[str, Any]:
-    """Return what the table shows of a drive."""
+    """Return the figures of the table for one drive."""
     closer, found, seconds = closed(keyframes)
     revisited = revisits(keyframes, truth)
     loops = closer.closed
@@ -138,7 +138,7 @@ def revisits(keyframes: "list[Keyframe]", truth: np.ndarray) -> np.ndarray:
 
 
 def error_of(T_target_source: np.ndarray, truth: np.ndarray, source: int, target: int) -> tuple[float, float]:
-    """Return by how much a relative pose is wrong, m and rad."""
+    """Return the error of a relative pose, m and rad."""
     wrong = np.linalg.inv(np.linalg.inv(truth[target]) @ truth[source]) @ T_target_source
     angle = np.arccos(np.clip((np.trace(wrong[:3, :3]) - 1) / 2, -1, 1))
     return float(np.linalg.norm(wrong[:3, 3])), float(angle)
@@ -167,13 +167,13 @@ def town(
     """Return a drive around a loop twice, in the right lane.
 
     Args:
-        name: of the world.
-        seed: of the world.
-        again: 1: the second time in the same direction; -1: in the opposite one.
-        aside: the second time so much farther to the left, m.
-        loop: crossings of the grid of blocks where it turns, counterclockwise; None: 1.1 km.
-        spacing: of the keyframes, m.
-        speed: m/s.
+        name: name of the world.
+        seed: seed of the world.
+        again: 1: the second lap has the same direction; -1: it has the opposite direction.
+        aside: offset of the second lap to the left, m.
+        loop: crossings of the grid of blocks at which the loop turns, counterclockwise; None: 1.1 km.
+        spacing: distance between keyframes, m.
+        speed: speed of the body, m/s.
     """
     from simulated_keyframes import drifted, keyframes_of, times_along
 
@@ -196,7 +196,7 @@ def lap_twice(
     from lio_jax.sim.world_registry import build
 
     world = build(name, seed).world
-    # the world's origin is where its own route begins
+    # the world's origin is the start of its own route
     path = rounded(np.array(loop or _LOOP) * PITCH - lap_of()[0], spacing=spacing)
     first = driven(world, path, -LANE)
     second = driven(world, path if again > 0 else path[::-1], aside - LANE)
@@ -218,7 +218,7 @@ def tunnel(spacing: float = 1.0) -> Drive:
 
 
 def alike(length: float = 700.0, spacing: float = 1.0) -> Drive:
-    """Return a drive out along a street and back along the next one, in a town whose blocks are all the same.
+    """Return a drive out along a street and back along the next one, in a town of equal blocks.
 
     No place is seen twice.
     """
@@ -227,7 +227,7 @@ def alike(length: float = 700.0, spacing: float = 1.0) -> Drive:
     pitch = 60.0
     world = town_of_equal_blocks(pitch, int(length / pitch) + 4, 4)
     around = rounded([(0, 0), (length, 0), (length, pitch), (0, pitch)], spacing=spacing)
-    # as far as the corner where the first street would be reached again
+    # up to the corner before the first street is reached again
     path = around[(around[:, 0] > 10) | (np.arange(len(around)) > 20)][: int((2 * length + 20) / spacing)]
     truth = driven(world, path, above=3.0)
     odometry = drifted(truth, scale=-0.02, heading=0.0, noise=0.02)
@@ -235,13 +235,13 @@ def alike(length: float = 700.0, spacing: float = 1.0) -> Drive:
 
 
 def town_of_equal_blocks(pitch: float, columns: int, rows: int) -> Any:
-    """Return a grid of streets whose blocks, so many m long and wide, repeat each other exactly."""
+    """Return a grid of streets with equal blocks of the given pitch, m."""
     from lio_jax.sim.assembly import assembled, draws, upright
 
     rng = np.random.default_rng(4)
     houses = 16
     place = rng.uniform(8.0, pitch - 8.0, (houses, 2))
-    # along the four sides, for the streets to see them
+    # along the four sides, so that they are visible from the streets
     place[np.arange(houses), np.arange(houses) % 2] = np.where(np.arange(houses) % 4 < 2, 9.0, pitch - 9.0)
     width, depth, height = draws(rng, houses, (1.0, 4.0), (1.0, 4.0), (2.0, 9.0))
     half = np.stack([width / 2, depth / 2, height / 2], axis=1)

@@ -1,4 +1,4 @@
-"""A KITTI raw drive's reference from INS attitude and integrated INS velocity, free of GPS position jumps."""
+"""A KITTI raw drive's reference from INS attitude and integrated INS velocity, without GPS position jumps."""
 
 from pathlib import Path
 
@@ -16,10 +16,10 @@ _STEP_NS = 2_000_000
 def ins_reference(folder: Path) -> Trajectory:
     """Return T_world_imu every 2 ms: spline of the attitudes, integral of a spline of the velocities.
 
-    Dense, so that its linear interpolation between samples is as good as the splines.
+    Samples are dense, so that linear interpolation between them is as exact as the splines.
 
     Args:
-        folder: of the drive's OXTS packets (data/ and timestamps.txt).
+        folder: folder of the drive's OXTS packets (data/ and timestamps.txt).
     """
     packets = read_oxts(folder, print)
     if packets is None:

@@ -1,11 +1,11 @@
-"""Pose graphs against gtsam: time to the optimum, from edges alone, s.
+"""Pose graphs against gtsam: time from edges alone to the optimum, s.
 
     python experiments/bench/pose_graph.py [--repeats 5] [--only NAME ...] [--json]
 
-Both find their own first guess (chordal) and descend from it, gtsam by its Levenberg-Marquardt with its own
-settings; both have the graph in memory. They take turns in one process; given are the least time and the
-median. Programs are compiled before. "odometry" is gtsam from the guess that neighbours' edges make,
-or from the file's own. Recorded graphs are added where the recordings lie beside the checkout.
+Both compute their own initial guess (chordal) and optimise from it, gtsam by its Levenberg-Marquardt with
+default settings; both have the graph in memory. They take turns in one process; the table gives the least
+time and the median. Programs are compiled before. "odometry" is gtsam from the guess that neighbours' edges
+give, or from the file's own guess. Recorded graphs are added if the recordings are next to the checkout.
 """
 
 import argparse
@@ -80,7 +80,7 @@ def _read(path: Path) -> "PoseGraph":
 
 
 def _torus() -> "PoseGraph":
-    """Return 5,000 poses that wind around a torus, each joined to its neighbour of the winding before."""
+    """Return 5,000 poses that wind around a torus, each joined to its neighbour in the previous winding."""
     around, across = 100, 50
     count = around * across
     number = np.arange(count)
@@ -92,7 +92,7 @@ def _torus() -> "PoseGraph":
 
 
 def _chain() -> "PoseGraph":
-    """Return 4,500 keyframes, 1 m apart, of rounds through a town, with 100 loops between the rounds."""
+    """Return 4,500 keyframes, 1 m apart, of laps through a town, with 100 loops between the laps."""
     count, rounds = 4500, 9
     phase = 2 * np.pi * rounds * np.arange(count) / count
     t = np.stack([100 * np.cos(phase), 60 * np.sin(2 * phase), 3 * np.sin(phase / 5)], -1)
@@ -148,7 +148,7 @@ def _measured(name: str, graph: "PoseGraph", repeats: int) -> dict[str, Any]:
     compile_for(graph)
     compile_s = time.perf_counter() - begin
     factors, guess = gtsam_graph(graph), gtsam_values(graph.poses)
-    # its chordal initialisation knows no equality constraint, and leaves the first vertex not quite in place
+    # its chordal initialisation has no equality constraint, and moves the first vertex slightly
     anchored = gtsam.NonlinearFactorGraph(factors)
     anchored.remove(factors.size() - 1)
     tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)

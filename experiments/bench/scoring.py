@@ -1,4 +1,4 @@
-"""Errors of a trajectory against what is known about a recording, every pose at its own instant."""
+"""Errors of a trajectory against a recording's reference, each pose at its own instant."""
 
 from dataclasses import dataclass
 
@@ -12,31 +12,31 @@ from lio_jax.evaluation.association import match_by_time
 from lio_jax.evaluation.trajectory_error import absolute_error, relative_error
 
 _WINDOWS = (1, 10)
-"""Scans between the two poses of a pair, against an INS."""
+"""Numbers of scans between the two poses of a pair, against an INS."""
 
 _LOST_WINDOW_NS, _LOST_M, _LOST_DEG = 1_000_000_000, 0.5, 10.0
-"""Track counts as lost when the motion over this time is wrong by more than either."""
+"""Time (ns) over which the motion is compared, and errors (m, deg) above which track counts as lost."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What is true about a recording."""
+    """The reference of a recording."""
 
     kind: str
-    """poses: good poses; ins: good over short distances only; standing: the vehicle does not move."""
+    """poses: exact poses; ins: exact over short distances only; standing: the vehicle does not move."""
     trajectory: Trajectory
-    """T_world_lidar."""
+    """T_world_lidar of the reference."""
 
 
 def score(estimate: Trajectory, reference: Reference) -> dict[str, float]:
-    """Return the errors that make sense for this kind of reference.
+    """Return the errors that are meaningful for the kind of reference.
 
     Args:
-        estimate: T_world_lidar, stamped with the instants its poses refer to.
-        reference: of the same lidar.
+        estimate: T_world_lidar, stamped with the instants to which its poses refer.
+        reference: reference of the same lidar.
 
     Returns:
-        Name (with its unit as the last part) to value.
+        Values by name; the last part of a name is the unit.
     """
     matched = match_by_time(estimate, reference.trajectory)
     if reference.kind == "poses":
@@ -51,17 +51,17 @@ def score(estimate: Trajectory, reference: Reference) -> dict[str, float]:
 
 
 def lost_after(estimate: Trajectory, reference: Trajectory) -> float | None:
-    """Return after how many seconds the motion over a second is first badly wrong, or None if it never is.
+    """Return the time (s) at which the motion over a second first has a large error; None if it never has.
 
-    Slow drift is not a loss of track; standing still while the vehicle drives on, or diverging, is.
+    Slow drift is not a loss of track; a stop while the vehicle drives on, or divergence, is.
 
     Args:
-        estimate: stamped with the instants its poses refer to, ascending.
-        reference: of the same body.
+        estimate: poses stamped with the instants to which they refer, ascending.
+        reference: poses of the same body.
     """
     matched = match_by_time(estimate, reference)
     stamps = matched.estimate.stamp_ns
-    # the pose about a second before each; those of the first second have none
+    # the pose about a second before each one; those in the first second have none
     before = np.searchsorted(stamps, stamps - _LOST_WINDOW_NS, "right") - 1
     after = np.flatnonzero(before >= 0)
     before = before[after]
@@ -100,8 +100,8 @@ def _standing_errors(estimate: Trajectory) -> dict[str, float]:
 def _window_errors(estimate: Trajectory, reference: Trajectory, window: int) -> dict[str, float]:
     ours, true = _motions(estimate, window), _motions(reference, window)
     distance = np.linalg.norm(ours[:, :3, 3], axis=1) - np.linalg.norm(true[:, :3, 3], axis=1)
-    # beside the length: jitter to the sides shows here, and so does a constant error of the INS
-    # heading, the same for every system (on drive 0005 it is some 2 deg off the direction of travel)
+    # the whole vector, not only its length: jitter to the sides shows here, and so does a constant error of
+    # the INS heading, the same for every system (on drive 0005 about 2 deg off the direction of travel)
     translation = np.linalg.norm(ours[:, :3, 3] - true[:, :3, 3], axis=1)
     return {
         f"distance{window}_m": _rmse(distance),

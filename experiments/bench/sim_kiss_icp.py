@@ -1,9 +1,10 @@
-"""Let KISS-ICP track a simulated bag through its own bag reader: others can use our recordings.
+"""Track a simulated bag with KISS-ICP through its own bag reader: other systems can use our recordings.
 
     python experiments/bench/sim_kiss_icp.py [--bag BAG] [--world city] [--sensor vlp16] [--duration 60]
 
-Without ``--bag`` one is simulated first, ROS 1 with the driver's layout. Prints the absolute trajectory error
-of the sensor, aligned over the whole drive, and its share of the path. Needs ``pip install lio-jax[bench]``.
+Without ``--bag`` a bag is simulated first, ROS 1 with the driver's layout. Prints the absolute trajectory
+error of the sensor, aligned over the whole drive, and its share of the path. Needs ``pip install
+lio-jax[bench]``.
 """
 
 import argparse
@@ -25,7 +26,7 @@ from lio_jax.evaluation.trajectory_error import absolute_error
 
 
 def main() -> None:
-    """Track one bag and print how well it went."""
+    """Track one bag and print the errors."""
     options = _options()
     with tempfile.TemporaryDirectory() as folder:
         bag = options.bag or _simulated(Path(folder) / "simulated.bag", options)
@@ -54,7 +55,7 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--bag", type=Path, help="a bag that lio-jax sim wrote, its truth beside it")
+    parser.add_argument("--bag", type=Path, help="a bag that lio-jax sim wrote, with its truth files")
     parser.add_argument("--world", default="city")
     parser.add_argument("--sensor", default="vlp16")
     parser.add_argument("--duration", type=float, default=60.0, help="s")

@@ -1,4 +1,4 @@
-"""Simulated chains: inertial samples and measurements of known noise along a random motion."""
+"""Simulated chains: inertial samples and measurements with known noise along a random motion."""
 
 import dataclasses
 from functools import partial
@@ -19,7 +19,7 @@ from lio_jax.imu.preintegration import Preintegrated, preintegrate_parallel
 from lio_jax.imu.sampling import Intervals
 
 STEP = 1 / 200
-"""Between inertial samples, s."""
+"""Time between inertial samples, s."""
 PER_LINK = 20
 GRAVITY = jnp.array([0.0, 0.0, -9.81])
 IMU = ImuParams(
@@ -30,7 +30,7 @@ IMU = ImuParams(
     gravity=jnp.array(9.81),
 )
 POSE_SIGMA = jnp.array([0.005, 0.005, 0.005, 0.02, 0.02, 0.02])
-"""rad, m."""
+"""Standard deviations of a pose, rad then m."""
 PRIOR_SIGMA = jnp.repeat(jnp.array([0.01, 0.05, 0.1, 0.005, 0.05]), 3)
 LEVER_ARM = jnp.array([0.3, -0.2, 0.5])
 GPS_SIGMA = jnp.array([0.5, 0.5, 1.0])
@@ -42,7 +42,7 @@ class Recording(eqx.Module):
     chain: Chain
     truth: MotionState
     guess: MotionState
-    """Dead reckoning from the prior's mean, corrected by nothing."""
+    """Initial guess: dead reckoning from the prior's mean."""
     intervals: Intervals
     shares: NoiseShares
 
@@ -52,7 +52,7 @@ def rows(tree, which):
 
 
 def along(first: MotionState, links: Preintegrated) -> MotionState:
-    """Return the states that a chain of links leads through."""
+    """Return the states along a chain of links."""
 
     def follow(state, link):
         return (predicted(link, GRAVITY, state),) * 2
@@ -62,7 +62,7 @@ def along(first: MotionState, links: Preintegrated) -> MotionState:
 
 
 def once_more(tree):
-    """Repeat the last row: links have one row more than there are."""
+    """Repeat the last row, because arrays of links have one more row than there are links."""
     return jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf[-1:]]), tree)
 
 
@@ -73,14 +73,14 @@ def links_of(intervals, gyro_bias, accel_bias, params: ImuParams) -> Preintegrat
 
 @jax.jit
 def preintegrated_anew(recording: Recording, states: MotionState, params: ImuParams = IMU) -> Recording:
-    """Return the recording with its samples preintegrated with the states' biases instead of zero."""
+    """Return the recording with its samples preintegrated at the states' biases instead of zero."""
     links = links_of(recording.intervals, states.gyro_bias[:-1], states.accel_bias[:-1], params)
     return eqx.tree_at(lambda r: r.chain.imu, recording, once_more(links))
 
 
 @partial(jax.jit, static_argnames=("count", "extras"))
 def simulate(seed, count: int, params: ImuParams = IMU, extras: bool = False) -> Recording:
-    """Return a recording of ``count`` states; with GPS and relative poses too if ``extras``."""
+    """Return a recording of ``count`` states; with ``extras`` also GPS and relative poses."""
     keys = iter(jax.random.split(jax.random.key(seed), 20))
     links = count - 1
     time = STEP * jnp.arange(links * PER_LINK)[:, None]
@@ -128,7 +128,7 @@ def simulate(seed, count: int, params: ImuParams = IMU, extras: bool = False) ->
 
     def noisy(pose, key, sigma):
         error = sigma * jax.random.normal(key, (len(pose.wxyz_xyz), 6))
-        # jaxlie's order is translation before rotation
+        # jaxlie stores the translation before the rotation
         return pose @ jaxlie.SE3.exp(error[:, [3, 4, 5, 0, 1, 2]])
 
     def poses(size):

@@ -1,4 +1,4 @@
-"""Keyframes of drives through simulated worlds, without an odometry: its drift is put on by a formula."""
+"""Keyframes of drives through simulated worlds, without an odometry: a formula adds the drift."""
 
 from collections.abc import Sequence
 
@@ -19,27 +19,27 @@ from lio_jax.sim.worlds import Counts, World, counts_along, nearest_part
 _Array = NDArray[np.float64]
 
 SPARSE = spinning_lidar(16, 512, elevation_deg=(-15.0, 15.0))
-"""16 beams, 512 firings a turn."""
+"""A lidar with 16 beams and 512 columns in a turn."""
 _BODY_HEIGHT = 1.6
 _SPACING = 0.4
 _COVARIANCE = np.diag([1e-3**2] * 3 + [1e-2**2] * 3)
-"""Of a step, as a run takes it by default."""
+"""Covariance of a step, as a run uses it by default (rotation rad, translation m)."""
 
 
 def rounded(vertices: Sequence[Sequence[float]], radius: float = 7.0, spacing: float = 1.0) -> _Array:
-    """Return a closed polygon with rounded corners as points so far apart, (n, 2) m.
+    """Return points with the given spacing on a closed polygon with rounded corners, (n, 2) m.
 
     Args:
         vertices: (k, 2) m, in driving order.
-        radius: of the corners, m.
-        spacing: m.
+        radius: radius of the corners, m.
+        spacing: distance between the points, m.
     """
     corners = np.asarray(vertices, np.float64)
     fine = []
     for before, corner, after in zip(np.roll(corners, 1, 0), corners, np.roll(corners, -1, 0), strict=True):
         arrive, leave = ((away - corner) / np.linalg.norm(away - corner) * radius for away in (before, after))
         share = np.linspace(0, 1, 20)[:, None]
-        # a quadratic curve tangent to both sides
+        # a quadratic curve that is tangent to both sides
         fine.append(corner + (1 - share) ** 2 * arrive + share**2 * leave)
     path = np.concatenate([*fine, fine[0][:1]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
@@ -51,10 +51,10 @@ def driven(world: World, path: _Array, aside: float = 0.0, above: float = 8.0) -
     """Return the poses T_world_imu of a body that drives along a path, (n, 4, 4).
 
     Args:
-        world: whose ground it drives on.
-        path: (n, 2) m.
-        aside: to the left of the path, m.
-        above: a height, in world, under which there is nothing but the ground along the path, m.
+        world: the world on whose ground it drives.
+        path: (n, 2) m, world frame.
+        aside: offset to the left of the path, m.
+        above: a height in the world with only the ground below it along the path, m.
     """
     ahead = np.gradient(path, axis=0)
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
@@ -71,14 +71,14 @@ def driven(world: World, path: _Array, aside: float = 0.0, above: float = 8.0) -
 
 
 def drifted(poses: _Array, scale: float, heading: float, noise: float = 0.0, seed: int = 0) -> _Array:
-    """Return what a bad odometry makes of true poses, (n, 4, 4), level as an inertial one is.
+    """Return true poses with the drift of a bad odometry, (n, 4, 4), level like those of an inertial one.
 
     Args:
         poses: (n, 4, 4) T_world_imu.
-        scale: share by which it measures ways too long.
-        heading: by which it turns too far, rad per m.
-        noise: standard deviation of its position after 1 m, m; grows by the way's root.
-        seed: of the noise.
+        scale: relative error of its distances, positive for too long ones.
+        heading: error of its heading, rad per m.
+        noise: standard deviation of its position after 1 m, m; it grows with the root of the distance.
+        seed: seed of the noise.
     """
     rng = np.random.default_rng(seed)
     steps = np.diff(poses[:, :3, 3], axis=0)
@@ -93,7 +93,7 @@ def drifted(poses: _Array, scale: float, heading: float, noise: float = 0.0, see
 
 
 def times_along(poses: _Array, speed: float = 8.0) -> _Array:
-    """Return when a body with constant speed passes poses, (n,) s from the first."""
+    """Return the times at which a body with constant speed passes poses, (n,) s from the first."""
     way = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(way)]) / speed
 
@@ -101,15 +101,15 @@ def times_along(poses: _Array, speed: float = 8.0) -> _Array:
 def keyframes_of(
     world: World, poses: _Array, odometry: _Array, times: _Array, lidar: Lidar = SPARSE, seed: int = 0
 ) -> list[Keyframe]:
-    """Return what is seen from poses one after the other, (k,).
+    """Return the keyframes with the scans from consecutive poses, (k,).
 
     Args:
-        world: what is seen.
+        world: the world that is scanned.
         poses: (k, 4, 4) T_world_imu; lidar and IMU coincide.
-        odometry: (k, 4, 4) what the keyframes say.
-        times: (k,) s.
+        odometry: (k, 4, 4) poses of the keyframes by the odometry.
+        times: (k,) s, times of the poses.
         lidar: the sensor; it stands still during a sweep.
-        seed: of the sensor's noise.
+        seed: seed of the sensor's noise.
     """
     keyframes = []
     with jax.enable_x64(True):
@@ -149,7 +149,7 @@ def _seen(
 
 
 def _ground(world: World, path: _Array, above: float) -> _Array:
-    """Return the height of what lies below, (n,) m."""
+    """Return the height of the surface below, (n,) m."""
     with jax.enable_x64(True):
         counts = counts_along(world, jnp.asarray(np.pad(path, ((0, 0), (0, 1)))), 1.0)
         return np.asarray(_below(world, counts, jnp.asarray(path), jnp.float64(above)))

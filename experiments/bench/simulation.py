@@ -1,10 +1,10 @@
-"""How fast are recordings simulated, and does memory stay flat?
+"""How fast are recordings simulated, and does memory stay constant?
 
     python experiments/bench/simulation.py [--world city] [--sensors vlp16 hdl64] [--scans 50] [--hour]
         [--json]
 
-Every sensor runs in a process of its own, so that its peak memory is its own. With --hour the recording is an
-hour long, with its IMU samples, truth and GPS in memory, and its scans are taken from all over it.
+Every sensor runs in a process of its own, which gives its peak memory. With --hour the recording is an hour
+long, with its IMU samples, truth and GPS in memory, and its scans are taken from all parts of it.
 """
 
 import argparse
@@ -18,7 +18,7 @@ import numpy as np
 
 
 def measured(world: str, sensor: str, scans: int, hour: bool) -> dict[str, float | str]:
-    """Simulate in this process and return the figures."""
+    """Simulate in this process and return times and memory."""
     from lio_jax.sim.gps import GpsModel
     from lio_jax.sim.imu import ImuModel
     from lio_jax.sim.sequence import SimulatedSequence
@@ -27,7 +27,7 @@ def measured(world: str, sensor: str, scans: int, hour: bool) -> dict[str, float
     began = time.perf_counter()
     sequence = SimulatedSequence(world, sensor, duration, imu=ImuModel(), gps=GpsModel())
     opened = time.perf_counter()
-    # held in memory while scans are cast, as whoever writes a recording does
+    # held in memory while scans are cast, as a program that writes a recording does
     held = (sequence.imu(), sequence.truth(), sequence.gps(), sequence.truth_arrays())
     ready = time.perf_counter()
     next(sequence.scans())

@@ -1,11 +1,12 @@
-"""What the smoother costs in float64, beside gtsam's batch Levenberg-Marquardt on the same factors.
+"""Time of the smoother in float64, compared with gtsam's batch Levenberg-Marquardt on the same factors.
 
     python experiments/bench/smoother.py [--windows 20 100] [--lengths 500 1000 2000 4000 8000] [--repeats 5]
         [--json]
 
-"update" is a new state in a full window: the oldest is marginalised, the rest smoothed anew. "iteration" is
-one linearisation and solve of a whole recording, "solve" a whole solve from a guess that is off by 0.05 rad,
-0.05 m and 0.05 m/s; gtsam gets the same factors and guess with its default settings. Both take turns.
+"update" adds a state to a full window: the oldest state is marginalised, the rest is smoothed again.
+"iteration" is one linearisation and solve of a whole recording, "solve" a whole solve from a guess with
+errors of 0.05 rad, 0.05 m and 0.05 m/s; gtsam gets the same factors and guess with its default settings. Both
+take turns.
 """
 
 import argparse
@@ -30,7 +31,7 @@ from lio_jax.estimation.sliding_window import Added, append_and_update, open_win
 from lio_jax.estimation.smoother import smooth  # noqa: E402
 
 TOLERANCE = 1e-3
-"""Sigmas."""
+"""Tolerance of a solve, in standard deviations."""
 
 
 def main() -> None:
@@ -65,7 +66,7 @@ def main() -> None:
 
 
 def window_figures(capacity: int) -> dict[str, float]:
-    """Return the time of updates once the window is full."""
+    """Return the time of updates after the window is full."""
     recording = simulate(0, capacity + 41)
     chain = recording.chain
     advance = jax.jit(partial(append_and_update, max_iterations=10, tolerance=jnp.array(TOLERANCE)))
@@ -86,7 +87,7 @@ def window_figures(capacity: int) -> dict[str, float]:
 
 
 def batch_figures(length: int, repeats: int) -> dict[str, float]:
-    """Return the times of one iteration and of a solve, and gtsam's."""
+    """Return the times of one iteration and of a solve, and the times of gtsam."""
     recording = off_by(simulate(0, length), 0.05)
     theirs = GtsamChain(recording)
     graph, values = theirs.graph(), theirs.values()
@@ -106,7 +107,7 @@ def batch_figures(length: int, repeats: int) -> dict[str, float]:
         optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams())
         spent["gtsam"].append(timed(optimiser.optimize)[0])
     one, solve, peer = (float(np.median(spent[name])) for name in ("one", "solve", "gtsam"))
-    # what is done once, such as the links' information, is in a solve but not in an iteration
+    # work that is done once, for example the links' information, is in a solve but not in an iteration
     iteration = (solve - one) / (int(solved.iterations) - 1)
     return {
         "states": length,
@@ -123,14 +124,14 @@ def batch_figures(length: int, repeats: int) -> dict[str, float]:
 
 
 def off_by(recording: Recording, sigma: float) -> Recording:
-    """Return the recording with a guess around the truth; dead reckoning would be miles off."""
+    """Return the recording with a guess near the truth; dead reckoning would be far away from it."""
     shape = (*recording.truth.velocity.shape[:1], 15)
     error = sigma * jax.random.normal(jax.random.key(1), shape) * (jnp.arange(15) < 9)
     return dataclasses.replace(recording, guess=recording.truth.retract(error))
 
 
 def timed(program: Callable[[], Any]) -> tuple[float, Any]:
-    """Return milliseconds, and what came out."""
+    """Return the time (ms) and the result."""
     begin = time.perf_counter()
     result = program()
     if not isinstance(result, gtsam.Values):

@@ -1,8 +1,8 @@
-"""What a run costs beside its scans: compilation cold and warm, the whole command, peak memory.
+"""Costs of a run besides its scans: cold and warm compilation, the whole command, peak memory.
 
     python experiments/bench/startup.py RECORDING [--scans 60] [--runs 3] [--json]
 
-Each run is a process of its own; the first has an empty compilation cache.
+Each run is a separate process; the first starts with an empty compilation cache.
 """
 
 import argparse
@@ -19,7 +19,7 @@ import numpy as np
 
 
 def timed_run(recording: Path, scans: int, work: Path, name: str) -> dict[str, Any]:
-    """Run the command line once and return its figures."""
+    """Run the command line once and return times and memory."""
     out = work / name
     command = [sys.executable, "-m", "lio_jax.cli", "run", str(recording), "--out", str(out)]
     environment = os.environ | {"LIO_JAX_CACHE": str(work / "cache")}

@@ -12,29 +12,29 @@ Pose = NDArray[np.float64]
 
 
 class System(Protocol):
-    """One odometry run; a fresh instance starts at the identity."""
+    """One odometry run; a new instance starts at the identity."""
 
     name: ClassVar[str]
     instant: ClassVar[float]
-    """Which instant of a sweep its poses refer to: 0 the start, 1 the end."""
+    """Instant of a sweep to which the poses refer: 0 is the start, 1 the end."""
     instant_reason: ClassVar[str]
-    """One sentence on why."""
+    """One sentence on the reason for that instant."""
 
     def warm_up(self, scans: list[LidarScan]) -> None:
-        """Do what only has to be done once (compile, start threads); this instance is thrown away after."""
+        """Do the work that is needed once (compile, start threads); this instance is not used afterwards."""
         ...
 
     def prepare(self, scan: LidarScan) -> Any:
-        """Return what the system's own reader would hand over; not timed, it counts as decoding."""
+        """Return what the system's own reader would return; not timed, because it counts as decoding."""
         ...
 
     def register(self, prepared: Any) -> Pose:
-        """Return T_world_lidar (4, 4) on the host; timed."""
+        """Return T_world_lidar (4, 4) on the host; this call is timed."""
         ...
 
 
 class KissIcp:
-    """KISS-ICP with its defaults; deskewing where the scan has times."""
+    """KISS-ICP with its defaults; it deskews where the scan has times."""
 
     name: ClassVar[str] = "kiss-icp"
     instant: ClassVar[float] = 1.0
@@ -53,7 +53,7 @@ class KissIcp:
             self.register(self.prepare(scan))
 
     def prepare(self, scan: LidarScan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        # times are normalised by their extent, and one of zero aborts the process; no times: no deskewing
+        # times are normalised by their range, and a zero range aborts the process; without times no deskewing
         has_times = scan.duration > 0 and np.ptp(scan.time) > 0
         times = scan.time.astype(np.float64) if has_times else np.empty(0)
         return scan.points.astype(np.float64), times
@@ -65,7 +65,7 @@ class KissIcp:
 
 
 class KissIcpNoDeskew(KissIcp):
-    """KISS-ICP without deskewing: at low speed its deskewing can feed jitter of one pose into the next."""
+    """KISS-ICP without deskewing: at low speed its deskewing can carry jitter of one pose into the next."""
 
     name: ClassVar[str] = "kiss-icp-no-deskew"
     instant: ClassVar[float] = 0.5
@@ -78,7 +78,7 @@ class KissIcpNoDeskew(KissIcp):
 
 
 class SmallGicp:
-    """small_gicp's scan-to-model odometry against a Gaussian voxel map, its own example's settings."""
+    """small_gicp's scan-to-model odometry with a Gaussian voxel map, with the settings of its own example."""
 
     name: ClassVar[str] = "small_gicp"
     instant: ClassVar[float] = 0.5
@@ -117,7 +117,7 @@ class SmallGicp:
 
 
 class EvalioLoam:
-    """The LOAM that evalio ships, with its defaults: it matches with three scans and does not deskew."""
+    """The LOAM that evalio contains, with its defaults: it matches with three scans and does not deskew."""
 
     name: ClassVar[str] = "evalio-loam"
     instant: ClassVar[float] = 0.5
@@ -167,4 +167,4 @@ class EvalioLoam:
 PEERS: dict[str, Callable[[int], System]] = {
     system.name: system for system in (KissIcp, KissIcpNoDeskew, SmallGicp, EvalioLoam)
 }
-"""Name to factory: ``factory(threads)``."""
+"""Factories by name: ``factory(threads)``."""

@@ -1,1 +1,1 @@
-"""Many runs at once, compared fairly: recordings x settings, each run once, gathered into a table."""
+"""Many runs compared fairly: each recording runs once with each set of settings."""

@@ -1,4 +1,7 @@
-"""Loaded by dask into each worker process of this machine."""
+"""Worker processes of an ablation: on this machine or at a dask scheduler.
+
+dask also loads this module into each worker process of this machine, and calls :func:`dask_setup` there.
+"""
 
 import asyncio
 import importlib.util
@@ -18,38 +21,38 @@ if TYPE_CHECKING:
 
 
 def dask_setup(worker: Any) -> None:
-    """Leave Ctrl-C, which a terminal sends to all processes, to the command."""
+    """Let the command alone handle Ctrl-C, which a terminal sends to all processes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 _WORKER_BYTES = 2 << 30
-"""Memory that a worker is given room for."""
+"""Memory for each worker, bytes."""
 _ANSWER_S = 10
 _ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-"""Runs beside each other are fastest with a thread each, and no result depends on the number of cores."""
+"""Parallel runs are fastest with one thread each, and no result depends on the number of cores."""
 
 
 @dataclass(frozen=True)
 class Workers:
-    """A dask client and what is known of the workers behind it."""
+    """A dask client, and the state of its workers."""
 
     client: "Client"
     count: Callable[[], int]
-    """How many there are now."""
+    """Function that returns the present number of workers."""
     deaths_allowed: int
-    """How often a run may take its worker down before it counts as failed."""
+    """Largest number of worker deaths during a run before the run counts as failed."""
     revive: Callable[[], None] = lambda: None
-    """Replaces workers that are gone for good."""
+    """Function that replaces workers that have ended for good."""
 
 
 @contextmanager
 def on_this_machine(most: int) -> Iterator[Workers]:
-    """Start workers for the block: one per GPU, else one per core as far as memory reaches.
+    """Start workers for the block: one per GPU, else one per core, as far as the memory suffices.
 
-    All of it listens on the loopback interface alone.
+    All of them listen on the loopback interface only.
 
     Args:
-        most: of the workers that have something to do.
+        most: largest number of workers that have work to do.
     """
     _check_installed()
     import dask
@@ -59,7 +62,7 @@ def on_this_machine(most: int) -> Iterator[Workers]:
     count = max(1, min(most, len(gpus) or _cores_with_memory()))
     environments = [_environment(gpus[number] if gpus else None) for number in range(count)]
     settings = {
-        # a run that takes its worker down is counted here, run by run, not by dask, group by group
+        # deaths of workers are counted here for each run; dask would count them for a group of runs
         "distributed.scheduler.allowed-failures": 0,
         "distributed.logging.distributed": "critical",
     }
@@ -74,9 +77,9 @@ def on_this_machine(most: int) -> Iterator[Workers]:
 
 
 class Crew:
-    """Worker processes of this machine, each kept alive by a dask nanny, and the nannies by this class.
+    """Worker processes of this machine; a dask nanny restarts each worker, and this class the nannies.
 
-    A nanny starts a worker that died anew, but gives up where it dies again while it starts.
+    A nanny restarts a worker that died, but gives up on a worker that dies again while it starts.
     """
 
     def __init__(self, cluster: "SpecCluster", environments: Sequence[dict[str, str]]) -> None:
@@ -93,10 +96,10 @@ class Crew:
         self._cluster.sync(self._close)
 
     def revive(self) -> None:
-        """Start what is not there.
+        """Start the workers that are missing.
 
         Raises:
-            LioJaxError: time and again it did not start.
+            LioJaxError: the workers failed to start repeatedly.
         """
         self._cluster.sync(self._start)
 
@@ -182,7 +185,7 @@ def _workers_of(client: "Client") -> int:
 
 
 def visible_gpus() -> list[str]:
-    """Return the GPUs that JAX would use, as $CUDA_VISIBLE_DEVICES names them, without touching any."""
+    """Return the GPUs that JAX would use, as $CUDA_VISIBLE_DEVICES names them, without opening any."""
     platforms = os.environ.get("JAX_PLATFORMS", "")
     plugins = ("jax_cuda12_plugin", "jax_cuda13_plugin")
     if not any(map(importlib.util.find_spec, plugins)) or (platforms and "cuda" not in platforms):

@@ -1,4 +1,4 @@
-"""Run the tasks of an ablation: on worker processes, or in the calling process for a notebook."""
+"""Run the tasks of an ablation on worker processes, or in the calling process for a notebook."""
 
 import threading
 from collections import Counter, deque
@@ -18,9 +18,9 @@ from lio_jax.data.whole_output import disk_errors_said
 from lio_jax.run.folder import write_text
 
 Perform = Callable[[tuple[Task, ...], Store], None]
-"""Leaves each task done or failed in the store, in order."""
+"""Function that runs tasks in order and leaves each one done or failed in the store."""
 Progress = Callable[[int, int], None]
-"""Told how many tasks are done, and how many have failed."""
+"""Function that receives the numbers of finished and of failed tasks."""
 
 _LOOK_EVERY_S = 0.5
 
@@ -33,26 +33,26 @@ def execute(
     prepare: Callable[[], None],
     progress: Progress,
 ) -> None:
-    """Return when every task is done or has failed.
+    """Run the tasks, and return when every task is done or has failed.
 
-    A worker that dies takes one run with it, which is begun again elsewhere; one that takes down worker after
-    worker counts as failed.
+    If a worker dies during a run, the run starts again on another worker. A run that ends several workers
+    counts as failed.
 
     Args:
-        workers: who does it.
-        store: where results go.
-        tasks: those that are done, or have failed, are left alone.
-        perform: does some tasks in a worker; found there by its name.
-        prepare: called in a worker before.
-        progress: called twice a second.
+        workers: the workers.
+        store: the folder of the results.
+        tasks: all tasks; those that are done, or have failed, are not run.
+        perform: function that runs tasks in a worker; it must be importable there.
+        prepare: function that is called in a worker first.
+        progress: function that is called twice a second.
 
     Raises:
-        LioJaxError: nothing can be written any more.
+        LioJaxError: results can no longer be written.
     """
     from distributed import wait
 
     keys = [task.key for task in tasks]
-    # workers may be at home elsewhere
+    # workers may have another working directory
     store = Store(store.root.resolve())
     deaths: Counter[str] = Counter()
     ended = _ended(store, keys)
@@ -60,7 +60,7 @@ def execute(
     waiting: dict[Any, tuple[Task, ...]] = {}
     try:
         while queue or waiting:
-            # no more than are worked on: a worker that dies must not be blamed on what only waits for it
+            # only as many as the workers run at once: a death must not be attributed to a waiting task
             while queue and len(waiting) < max(1, workers.count()):
                 piece = queue.popleft()
                 future = workers.client.submit(_work, prepare, perform, piece, store, pure=False)
@@ -90,7 +90,7 @@ def execute(
 
 
 def _left(store: Store, piece: tuple[Task, ...], future: Any) -> tuple[Task, ...]:
-    """Return what is left of a piece because its worker died at the first of them."""
+    """Return the remaining tasks of a piece whose worker died during one of them."""
     from distributed import KilledWorker
 
     error = future.exception()
@@ -105,7 +105,7 @@ _one_at_a_time = threading.Lock()
 
 
 def _work(prepare: Callable[[], None], perform: Perform, tasks: tuple[Task, ...], store: Store) -> None:
-    # a worker with several threads would hold several maps at once
+    # only one thread of a worker runs: several would hold several maps in memory
     with _one_at_a_time:
         prepare()
         perform(tasks, store)
@@ -116,18 +116,18 @@ def _ended(store: Store, keys: Sequence[str]) -> set[str]:
 
 
 def run_ablation(spec_path: Path, out: Path) -> Comparison:
-    """Run what a specification asks for, one run after the other, and compare.
+    """Run the ablation of a specification, one run after the other, and compare the results.
 
-    As ``lio-jax ablate`` does it, but with JAX as the caller has set it up. What ``out`` holds already is not
-    run again.
+    It works like ``lio-jax ablate``, with JAX as the caller has set it up. Runs whose results are in ``out``
+    already are not repeated.
 
     Args:
         spec_path: YAML file; see :mod:`lio_jax.ablation.spec`.
-        out: folder of the results, new or of an earlier ablation.
+        out: folder of the results, new or from an earlier ablation.
 
     Raises:
         UsageError: the specification is wrong, or the folder is taken.
-        LioJaxError: nothing can be written any more.
+        LioJaxError: results can no longer be written.
     """
     spec = load_spec(spec_path)
     tasks = tasks_of(spec)

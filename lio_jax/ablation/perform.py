@@ -1,4 +1,4 @@
-"""What a worker does: the runs of one recording and one static config, in order."""
+"""The work of one worker: the runs of one recording and one static config, in order."""
 
 import traceback
 from collections.abc import Callable, Iterator
@@ -24,19 +24,19 @@ from lio_jax.run.track import CompiledStep, Programs
 from lio_jax.settings.settings import Settings
 
 _KEPT = {"trajectory.tum", "metrics.json", "config.yaml"}
-"""Of a run folder, where not everything is kept."""
+"""Files of a run folder that are kept if not everything is kept."""
 _LARGEST_BATCH = 64
 _NOT_WRITTEN = {"config.output.map": False, "config.output.recording": False, "config.output.plot": False}
 
 WholeRun = Callable[[Sequence, Settings, Path, Source, Trajectory | None], dict[str, Any]]
-"""Makes a whole run folder as ``lio-jax run`` does, and returns its metrics."""
+"""Function that writes a whole run folder as ``lio-jax run`` does, and returns its metrics."""
 
 
 def perform(tasks: tuple[Task, ...], store: Store, whole_run: WholeRun | None = None) -> None:
-    """Leave each task done or failed in the store; what is so already is left alone.
+    """Leave each task done or failed in the store; tasks that are so already are not run again.
 
     Raises:
-        DiskError: nothing can be written any more.
+        DiskError: results can no longer be written.
     """
     left = [task for task in tasks if not store.is_done(task.key) and not store.has_failed(task.key)]
     if not left:
@@ -61,7 +61,7 @@ def _recording(source: Source, key: str, config: DataConfig) -> tuple[Sequence, 
 
 
 def _batches(tasks: list[Task], sequence: Sequence) -> Iterator[list[Task]]:
-    """Yield the tasks that run in one program; on a CPU each alone: a batch costs more than it saves."""
+    """Yield the tasks that run in one program; on a CPU single tasks: a batch costs more than it saves."""
     import jax
 
     size = tasks[0].batch or (1 if jax.default_backend() == "cpu" else _LARGEST_BATCH)

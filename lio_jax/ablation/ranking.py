@@ -1,4 +1,4 @@
-"""Compare what the runs of an ablation gave, and rank its variants with intervals."""
+"""Compare the results of an ablation's runs, and rank its variants with paired tests."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -18,30 +18,32 @@ Case = tuple[str, int | None]
 
 SIGNIFICANT = 0.05
 _FEWEST_FOR_RANKS = 6
-"""With fewer pairs the signed-rank test cannot fall below 0.05, whatever they are."""
+"""Fewest pairs for the signed-rank test: with fewer its p cannot fall below 0.05 for any values."""
 _NO_DIFFERENCE = 1e-12
 
 
 @dataclass(frozen=True)
 class Ranked:
-    """One variant's place."""
+    """One variant's row of the ranking."""
 
     variant: str
     cases: int
-    """Recordings and seeds that it has a value of."""
+    """Number of pairs of recording and seed for which the variant has a value."""
     means: dict[str, float]
-    """Of each metric over its own cases; NaN where there are none."""
+    """Mean of each metric over the variant's own cases; NaN without any."""
     spread: float
-    """Standard deviation over the seeds of the mean over recordings, of the first metric; NaN below two."""
+    """Standard deviation over seeds of the first metric's mean over recordings; NaN with fewer than two."""
     ratio: float
-    """Geometric mean of value / baseline over the cases both have, of the first metric; NaN without any, or
-    where values are not positive."""
+    """Geometric mean of value / baseline of the first metric, over the cases of both.
+
+    NaN without common cases, or if some values are not positive.
+    """
     pairs: int
-    """Cases that both have."""
+    """Number of cases for which both the variant and the baseline have a value."""
     p_t: float
-    """Two-sided p of the paired t-test (of logarithms where all values are positive); NaN below two pairs."""
+    """Two-sided p of the paired t-test (of logarithms if all values are positive); NaN below two pairs."""
     p_ranks: float
-    """Two-sided p of Wilcoxon's signed-rank test on the same; NaN below six pairs."""
+    """Two-sided p of Wilcoxon's signed-rank test on these pairs; NaN with fewer than six pairs."""
     p_adjusted: float
     """p_t after Holm's correction for the number of variants."""
 
@@ -52,17 +54,18 @@ def ranking(
     baseline: str,
     cases: int,
 ) -> list[Ranked]:
-    """Rank variants by the mean of the first metric; those that lack cases come after those that have all.
+    """Rank variants by the mean of the first metric; incomplete variants come after complete ones.
 
-    Recordings differ in how hard they are, so variants are compared case by case: a ratio of 0.9 is 10 % less
-    error than the baseline's on the same recording and seed. A p below 0.05 in one of many comparisons means
-    little, hence Holm's correction (Holm, "A simple sequentially rejective multiple test procedure", 1979).
+    Recordings differ in difficulty, so variants are compared case by case: a ratio of 0.9 is an error 10 %
+    smaller than the baseline's on the same recording and seed. A p below 0.05 in one of many comparisons is
+    weak evidence, hence Holm's correction (Holm, "A simple sequentially rejective multiple test procedure",
+    1979).
 
     Args:
         values: metric -> variant -> case -> value; the first metric ranks.
-        variants: all of them.
-        baseline: what the others are compared with.
-        cases: how many there should be.
+        variants: names of all variants.
+        baseline: the variant with which the others are compared.
+        cases: the full number of cases.
     """
     first = next(iter(values))
     of_baseline = values[first].get(baseline, {})
@@ -92,7 +95,7 @@ def ranking(
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Return p values corrected for their number; NaN stays and does not count."""
+    """Return p values corrected for their number; NaN stays NaN and is not counted."""
     order = sorted((p, place) for place, p in enumerate(p_values) if not np.isnan(p))
     corrected, largest = [float("nan")] * len(p_values), 0.0
     for rank, (p, place) in enumerate(order):
@@ -120,7 +123,7 @@ def _spread(own: Mapping[Case, float]) -> float:
     for (_, seed), value in own.items():
         if seed is not None:
             by_seed.setdefault(seed, []).append(value)
-    # a seed that lacks a recording would differ by the recording, not by chance
+    # a seed without one of the recordings would differ because of the recording, not by chance
     whole = max(map(len, by_seed.values()), default=0)
     means = [float(np.mean(values)) for values in by_seed.values() if len(values) == whole]
     return float(np.std(means, ddof=1)) if len(means) > 1 else float("nan")
@@ -139,21 +142,21 @@ Values = dict[str, dict[str, dict[Case, float]]]
 
 @dataclass(frozen=True)
 class Comparison:
-    """What a table and a report show."""
+    """All that a table and a report show."""
 
     spec: Spec
     tasks: list[Task]
     done: set[str]
-    """Keys."""
+    """Keys of the finished tasks."""
     values: Values
     """Metric -> variant -> case -> value; the first metric ranks."""
     rows: list[Ranked]
     failures: dict[str, dict[str, str]]
-    """Key -> record."""
+    """Records of the failed tasks by key."""
 
     @property
     def metric(self) -> str:
-        """Return the metric that ranks."""
+        """Return the metric by which variants are ranked."""
         return self.spec.metrics[0]
 
     def __str__(self) -> str:
@@ -162,7 +165,7 @@ class Comparison:
 
 
 def compare(spec: Spec, tasks: list[Task], store: Store) -> Comparison:
-    """Read the results and rank them."""
+    """Read the results of all runs and rank them."""
     columns = list(dict.fromkeys((*spec.metrics, TIME)))
     table = gathered(store, tasks, columns)
     values: Values = {metric: {} for metric in columns}
@@ -179,7 +182,7 @@ def compare(spec: Spec, tasks: list[Task], store: Store) -> Comparison:
 
 
 def verdict(row: Ranked, baseline: str) -> str:
-    """Return what the paired test says of a variant."""
+    """Return the result of the paired test for a variant, in words."""
     if row.variant == baseline:
         return "baseline"
     if math.isnan(row.p_adjusted):
@@ -225,5 +228,5 @@ def as_text(comparison: Comparison) -> str:
 
 
 def number(value: float, digits: int = 4) -> str:
-    """Return a number as text, "-" where there is none."""
+    """Return a number as text; return "-" for NaN."""
     return "-" if math.isnan(value) else f"{value:.{digits}g}"

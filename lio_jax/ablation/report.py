@@ -23,15 +23,15 @@ if TYPE_CHECKING:
 _SIZE = (5.2, 3.6)
 _DARK, _LIGHT = "#1f5f8b", "#9db8cc"
 _LABELLED = 12
-"""More names than this cover each other."""
+"""Largest number of points with names: more names would cover each other."""
 
 
 def parameter_picture(path: str, values: Mapping[Any, list[float]], error: str) -> str:
     """Draw the error over a parameter's values: every run, and the mean of each value.
 
     Args:
-        path: of the parameter.
-        values: its value -> errors of all runs that had it.
+        path: path of the parameter.
+        values: value of the parameter -> errors of all runs with that value.
         error: label of the error's axis.
 
     Returns:
@@ -57,7 +57,7 @@ def parameter_picture(path: str, values: Mapping[Any, list[float]], error: str) 
 
 
 def pareto_picture(points: Mapping[str, tuple[float, float]], time: str, error: str) -> str:
-    """Draw the variants by what they cost and how much they err, and the front that none beats in both.
+    """Draw the variants by time and error, with the Pareto front, whose variants no other beats in both.
 
     Args:
         points: variant -> (time, error), finite.
@@ -81,7 +81,7 @@ def pareto_picture(points: Mapping[str, tuple[float, float]], time: str, error: 
 
 
 def pareto_front(points: Mapping[str, tuple[float, float]]) -> list[str]:
-    """Return the names that none beats in both numbers, by rising first number."""
+    """Return the names that no other beats in both numbers, sorted by the first number."""
     front, best = [], math.inf
     for name in sorted(points, key=lambda name: points[name]):
         if points[name][1] < best:
@@ -101,7 +101,7 @@ def _axes() -> "tuple[Figure, Axes]":
 
 
 def _plain(text: str) -> str:
-    """Keep matplotlib from reading a name as mathematics."""
+    """Return text in which matplotlib finds no mathematics."""
     return text.replace("$", r"\$")
 
 
@@ -109,7 +109,7 @@ def _uri(figure: "Figure") -> str:
     from matplotlib import rc_context
 
     buffer = io.BytesIO()
-    # the same results give the same bytes
+    # equal results give equal bytes
     with rc_context({"svg.hashsalt": "lio_jax", "svg.fonttype": "none", "font.family": "sans-serif"}):
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()
@@ -132,7 +132,7 @@ def write_report(comparison: Comparison, store: Store) -> None:
 
 
 def report(comparison: Comparison, store: Store) -> str:
-    """Return the page."""
+    """Return the page as HTML."""
     spec = comparison.spec
     total = len(comparison.tasks)
     size = f"{len(spec.variants)} variants on {len(spec.sources)} recordings"
@@ -163,7 +163,7 @@ def _explained(comparison: Comparison) -> str:
         f"the ratio to '{comparison.spec.baseline.name}' on the same recording and seed. p (t): two-sided "
         "paired t-test of the logarithms (of the values where some are not positive); p (ranks): Wilcoxon's "
         "signed-rank test on the same pairs, from six on. The verdict takes p (t), corrected by Holm for "
-        "the number of variants, below 0.05. Times are those of runs beside each other on one machine."
+        "the number of variants, below 0.05. Times are those of parallel runs on one machine."
     )
 
 
@@ -235,7 +235,7 @@ def _runs(comparison: Comparison, store: Store) -> str:
 
 
 def _table(names: Sequence[str], rows: Iterable[Sequence[str]], text: bool = False) -> str:
-    """Return a table; the names are escaped here, the cells before."""
+    """Return a table; names are escaped here, cells must be escaped already."""
     kind = '<td class="text">' if text else "<td>"
     head = "".join(f"<th>{escape(name)}</th>" for name in names)
     body = "".join("<tr>" + "".join(f"{kind}{cell}</td>" for cell in row) + "</tr>" for row in rows)

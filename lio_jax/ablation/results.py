@@ -1,4 +1,4 @@
-"""One row per run, in Parquet: the resolved settings, and every number of metrics.json."""
+"""One row per run, in Parquet: the resolved settings and every number of metrics.json."""
 
 import dataclasses
 import json
@@ -27,11 +27,11 @@ def write_result(
     """Write a run's row and manifest.
 
     Args:
-        folder: of the run.
-        task: what was asked for.
-        settings: as resolved with the recording.
-        metrics: of metrics.json, errors against truth included.
-        batch: parameter sets that ran in one program.
+        folder: folder of the run.
+        task: the requested run.
+        settings: settings after the recording has added its own.
+        metrics: contents of metrics.json, including errors against truth.
+        batch: number of parameter sets that ran in one program.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -53,10 +53,10 @@ def write_result(
 
 
 def gathered(store: Store, tasks: Iterable[Task], columns: Iterable[str]) -> "pa.Table":
-    """Return columns of all finished tasks, in the order of ``tasks``; what a run has not got is null.
+    """Return columns of all finished tasks, in the order of ``tasks``; values that a run lacks are null.
 
-    Only these columns are read. Names come from the tasks themselves, so that the same run may be called
-    otherwise in another specification.
+    Only these columns are read. The names come from the tasks themselves, because another specification may
+    name the same run differently.
     """
     import pyarrow as pa
     import pyarrow.dataset as ds

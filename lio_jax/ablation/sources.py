@@ -1,4 +1,4 @@
-"""The recordings that an ablation names, opened or simulated, and read once for several runs."""
+"""The recordings of an ablation: opened or simulated, and read once for several runs."""
 
 import hashlib
 import json
@@ -21,24 +21,24 @@ from lio_jax.data.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class Recorded:
-    """A recording on disk. The estimator draws nothing at random, so no seed changes its result."""
+    """A recording on disk. The estimator is deterministic, so no seed changes its result."""
 
     name: str
     path: str
     truth_file: str = ""
-    """Trajectory to compare with; "": the recording's own."""
+    """File with the true trajectory; "": the recording's own truth."""
     start: int = 0
-    """First scan."""
+    """Index of the first scan."""
     scans: int | None = None
-    """How many; None: to the end."""
+    """Number of scans; None: to the end."""
 
     @property
     def seed(self) -> int | None:
-        """None: nothing is random."""
+        """None: nothing in the recording is random."""
         return None
 
     def identity(self) -> dict[str, Any]:
-        """Return what the result depends on: every file's name, size and time of change, not its folder."""
+        """Return the properties that the result depends on: each file's name, size and time of change."""
         path = Path(self.path)
         files = sorted(entry for entry in path.rglob("*") if entry.is_file()) if path.is_dir() else [path]
         beside = [Path(self.truth_file)] if self.truth_file else pose_files(path)
@@ -59,12 +59,12 @@ class Recorded:
         """Open the recording.
 
         Raises:
-            LioJaxError: it is not there, or broken.
+            LioJaxError: the recording is missing or broken.
         """
         return open_sequence(Path(self.path), config)
 
     def truth(self, sequence: Sequence) -> Trajectory | None:
-        """Return the true T_world_imu, None where it is not known."""
+        """Return the true T_world_imu; None where it is not known."""
         if not self.truth_file:
             return sequence.truth()
         from lio_jax.evaluation.load import load_trajectory
@@ -80,24 +80,24 @@ class Simulated:
     """A drive through a simulated world."""
 
     name: str
-    """Without the seed."""
+    """Name of the recording without the seed."""
     sim: str
-    """World."""
+    """Name of the world."""
     seed: int = 0
-    """Of world, motion and noise."""
+    """Seed of world, motion and noise."""
     sensor: str = "generic32"
     duration: float = 10.0
-    """s."""
+    """Length of the recording, s."""
     beams: int | None = None
     columns: int | None = None
     imu: bool = True
-    """Whether there are inertial samples."""
+    """Whether the recording has inertial samples."""
     moving_start: bool = False
     start: int = 0
     scans: int | None = None
 
     def identity(self) -> dict[str, Any]:
-        """Return what the result depends on."""
+        """Return the properties that the result depends on."""
         return {key: value for key, value in asdict(self).items() if key != "name"}
 
     def open(self, config: DataConfig) -> Sequence:
@@ -136,7 +136,7 @@ SIMULATED_KEYS: dict[str, Any] = {
     "start": int,
     "scans": int,
 }
-"""What an entry of ``sequences`` may hold, and of which type."""
+"""Keys of an entry of ``sequences`` with ``sim``, and their types."""
 
 
 def key_of(source: Source) -> str:
@@ -145,15 +145,15 @@ def key_of(source: Source) -> str:
 
 
 def recorded(entry: dict[str, Any], folder: Path, place: str) -> list[Recorded]:
-    """Return the recordings that an entry with ``path`` names.
+    """Return the recordings of an entry with ``path``.
 
-    ``~`` and ``$VARIABLES`` are replaced, and ``{00..10}`` or ``{a,b}`` stands for several, as in a shell; a
-    truth file either holds for the only path, or names as many as there are paths.
+    ``~`` and ``$VARIABLES`` are replaced. As in a shell, ``{00..10}`` or ``{a,b}`` stands for several words.
+    A truth file belongs to a single path, or there are as many truth files as paths.
 
     Args:
-        entry: of RECORDED_KEYS, checked.
-        folder: relative paths start there.
-        place: file and key for messages.
+        entry: checked entry with the keys of RECORDED_KEYS.
+        folder: folder in which relative paths start.
+        place: file and key in messages.
     """
     paths = [_located(path, folder, place) for path in braces(entry["path"])]
     truths = [_located(path, folder, place) for path in braces(entry.get("truth") or "") if path]
@@ -170,7 +170,7 @@ def recorded(entry: dict[str, Any], folder: Path, place: str) -> list[Recorded]:
 
 
 def simulated(entry: dict[str, Any], seeds: tuple[int, ...], place: str) -> list[Simulated]:
-    """Return an entry with ``sim``, once per seed; ``entry`` is of SIMULATED_KEYS, checked."""
+    """Return an entry with ``sim`` once for each seed; ``entry`` is checked, with keys of SIMULATED_KEYS."""
     from lio_jax.sim.sensors import SENSORS
     from lio_jax.sim.world_registry import WORLDS
 
@@ -184,7 +184,7 @@ def simulated(entry: dict[str, Any], seeds: tuple[int, ...], place: str) -> list
 
 
 def braces(text: str) -> list[str]:
-    """Return the words that ``a{00..02}`` or ``a{x,y}`` stands for, as in a shell."""
+    """Return the words for which ``a{00..02}`` or ``a{x,y}`` stands, as in a shell."""
     found = re.search(r"\{([^{}]*(?:\.\.|,)[^{}]*)\}", text)
     if not found:
         return [text]
@@ -205,16 +205,16 @@ def _located(path: str, folder: Path, place: str) -> str:
             f"{place}: the environment variable {unset.group(1)} is not set; "
             f"set it, for example export {unset.group(1)}=/data/kitti."
         )
-    # workers may be at home elsewhere
+    # workers may have another working directory
     return os.path.abspath(folder / expanded)
 
 
 KEPT_BYTES = 1 << 30
-"""Most that is kept; a recording that needs more is decoded anew each time."""
+"""Most bytes that are kept; a larger recording is decoded again each time."""
 
 
 class KeptSequence:
-    """Replays another sequence, from memory where it was read before."""
+    """Replay another sequence; scans that were read before come from memory."""
 
     def __init__(self, sequence: Sequence, most_bytes: int = KEPT_BYTES) -> None:
         self._sequence = sequence

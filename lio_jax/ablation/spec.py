@@ -1,4 +1,4 @@
-"""The numbers that a run's metrics.json holds, by their paths."""
+"""An ablation's specification: its YAML file, checked, and the metrics it may ask for."""
 
 import dataclasses
 import difflib
@@ -37,21 +37,21 @@ METRICS: dict[str, str] = {
     "compile_s": "s",
     "wall_s": "s",
 }
-"""By path, with units; of all of them less is better, or they are mere counts."""
+"""Units of the metrics by their paths in metrics.json; they are counts, or smaller values are better."""
 
 DEFAULT_METRICS = ("ate.rmse", "ate.rotation_rmse", "rpe.rmse", "failed_scans", "scan_ms.total.median")
 
 TIME = "scan_ms.total.median"
-"""What a scan costs."""
+"""Metric for the time of a scan."""
 
 
 def is_timing(metric: str) -> bool:
-    """Return whether a metric differs from run to run on one machine."""
+    """Return whether a metric differs between equal runs on one machine."""
     return METRICS.get(metric) in ("ms", "s")
 
 
 def numbers_in(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """Return the numbers of a metrics.json by the names above."""
+    """Return the numbers of a metrics.json by the paths of METRICS."""
     flat = {"failed_scans": float(len(metrics.get("failures", ())))}
     for name in METRICS:
         value: Any = metrics
@@ -67,7 +67,7 @@ Keep = Literal["trajectory", "everything"]
 
 @dataclass(frozen=True)
 class Spec:
-    """A checked ablation."""
+    """A checked specification."""
 
     name: str
     sources: list[Source]
@@ -76,16 +76,16 @@ class Spec:
     metrics: tuple[str, ...]
     keep: Keep
     batch: int | None
-    """Parameter sets in one program; None: as the device suggests."""
+    """Number of parameter sets in one program; None: depends on the device."""
     text: str
-    """The file."""
+    """Text of the file."""
 
 
 def load_spec(path: Path) -> Spec:
     """Read and check a specification.
 
     Raises:
-        UsageError: not readable, not YAML, an unknown key or an impossible value, nothing to compare; the
+        UsageError: not readable, not YAML, an unknown key, an impossible value, or nothing to compare; the
             sentence names file and key, and the nearest valid key.
     """
     try:

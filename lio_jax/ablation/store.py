@@ -1,9 +1,9 @@
-"""The folder of an ablation: what is done, what failed and why. It is the only truth about both.
+"""The folder of an ablation, the only record of its results and of its failures with their reasons.
 
-spec.yaml             as it was last run
-tasks/KEY/            one finished run, there whole or not at all:
+spec.yaml             as of the last command
+tasks/KEY/            one finished run, complete or absent:
     result.parquet    one row: settings and metrics
-    manifest.json     what was run, with which versions, on which machine
+    manifest.json     the run's settings, versions of packages, and machine
     trajectory.tum  metrics.json  config.yaml
 failed/KEY.json       why a run failed
 report.html
@@ -24,30 +24,30 @@ from lio_jax.run.folder import write_json
 
 
 class DiskError(LioJaxError):
-    """Nothing can be written any more, so no further run is worth starting."""
+    """Results can no longer be written, so no further run is worth starting."""
 
 
 @dataclass(frozen=True)
 class Store:
-    """Results by a task's key."""
+    """The results of tasks by their keys."""
 
     root: Path
 
     def folder(self, key: str) -> Path:
-        """Return where a task's result is, or will be."""
+        """Return the folder of a task's result, whether it exists or not."""
         return self.root / "tasks" / key
 
     def is_done(self, key: str) -> bool:
-        """Return whether the task's result is there."""
+        """Return whether the task's result exists."""
         return self.folder(key).is_dir()
 
     def done(self, keys: Iterable[str]) -> list[str]:
-        """Return those that are done, by one look at the folder."""
+        """Return the keys that are done, from one listing of the folder."""
         there = _names(self.root / "tasks")
         return [key for key in keys if key in there]
 
     def failed(self, keys: Iterable[str]) -> list[str]:
-        """Return those that failed, by one look at the folder."""
+        """Return the keys that failed, from one listing of the folder."""
         failed, done = _names(self.root / "failed"), _names(self.root / "tasks")
         return [key for key in keys if f"{key}.json" in failed and key not in done]
 
@@ -62,10 +62,10 @@ class Store:
 
     @contextmanager
     def result(self, key: str) -> Iterator[Path]:
-        """Yield a hidden folder; it becomes the task's result when the block ends without an exception.
+        """Yield a hidden folder that becomes the task's result if the block ends without an exception.
 
         Raises:
-            DiskError: the disk takes no more.
+            DiskError: the disk is full or cannot be written.
         """
         with _disk_errors(), written_whole(self.folder(key)) as folder:
             folder.mkdir()
@@ -79,19 +79,19 @@ class Store:
             write_json(path, {"run": run, "reason": reason, "traceback": traceback})
 
     def forget_failures(self, keys: Iterable[str]) -> None:
-        """Let tasks that failed be tried again."""
+        """Remove the records of failures, so that the tasks are tried again."""
         for key in keys:
             (self.root / "failed" / f"{key}.json").unlink(missing_ok=True)
 
 
 @contextmanager
 def opened(root: Path) -> Iterator[Store]:
-    """Hold an ablation's folder during the block, so that no other command works on it.
+    """Hold an ablation's folder during the block, so that no other command uses it.
 
-    What killed runs left behind is removed.
+    Remains of killed runs are removed.
 
     Raises:
-        UsageError: it is a file, cannot be made, holds something else, or another command is at work there.
+        UsageError: it is a file, cannot be made, holds something else, or is in use by another command.
     """
     if root.is_file():
         raise UsageError(f"{root}: is a file; give a folder for the ablation's results.")

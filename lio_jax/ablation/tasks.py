@@ -1,4 +1,4 @@
-"""The runs of an ablation, each named by a hash of everything its result depends on."""
+"""The runs of an ablation, each with a key: a hash of everything that its result depends on."""
 
 import hashlib
 import json
@@ -15,12 +15,12 @@ from lio_jax.ablation.variants import Variant
 from lio_jax.settings.settings import Settings
 
 _FORMAT = 1
-"""Of what a task leaves behind; another number runs everything anew."""
+"""Version of the files that a task leaves; another number runs everything again."""
 _CODE = (
     *("core", "imu", "lidar", "mapping", "registration", "estimation", "loops"),
     *("recipes", "data", "sim", "run", "evaluation"),
 )
-"""The packages that a run's result depends on."""
+"""Packages of the code that a run's result depends on."""
 
 
 @dataclass(frozen=True)
@@ -31,18 +31,18 @@ class Task:
     variant: Variant = field(hash=False)
     keep: str
     batch: int | None
-    """Parameter sets in one program; the result does not depend on it."""
+    """Number of parameter sets in one program; the result does not depend on it."""
     key: str
-    """Hash of the recording's identity, the settings, what is kept and the code."""
+    """Hash of the recording's identity, the settings, the kept files and the code."""
     source_key: str
 
     @property
     def settings(self) -> Settings:
-        """Return the settings, before the recording adds its own."""
+        """Return the settings before the recording adds its own."""
         return self.variant.settings
 
     def describe(self) -> str:
-        """Return a line for a person."""
+        """Return a line that describes the task to the user."""
         seed = "" if self.source.seed is None else f" seed {self.source.seed}"
         return f"{self.source.name}{seed}, {self.variant.name}"
 
@@ -68,7 +68,7 @@ def tasks_of(spec: Spec) -> list[Task]:
 
 @cache
 def code_version() -> str:
-    """Return a hash of the code that a result depends on, and of JAX's version."""
+    """Return a hash of the code that results depend on, and of JAX's version."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256(f"jax {version('jax')} jaxlib {version('jaxlib')}".encode())
     for name in _CODE:
@@ -78,10 +78,10 @@ def code_version() -> str:
 
 
 def pieces(tasks: Iterable[Task], workers: int) -> list[tuple[Task, ...]]:
-    """Put the tasks together that one worker does in order.
+    """Group the tasks that one worker does in order.
 
-    Those of one recording and one static config share their compiled programs and decoded scans. A group is
-    split only where it would keep one worker busy while others have nothing to do.
+    Tasks with the same recording and static config share compiled programs and decoded scans. A group is
+    split only if other workers would have nothing to do.
     """
     groups: dict[Any, list[Task]] = {}
     tasks = list(tasks)

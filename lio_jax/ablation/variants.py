@@ -1,4 +1,4 @@
-"""The settings that an ablation compares: grid, zip, random draws and a list of overrides."""
+"""The settings that an ablation compares: a grid, zipped lists, random draws, or a list of overrides."""
 
 import itertools
 import json
@@ -18,21 +18,21 @@ Overrides = dict[str, Any]
 
 @dataclass(frozen=True)
 class Variant:
-    """One point of the comparison."""
+    """One set of settings in the comparison."""
 
     name: str
-    """Short, for tables."""
+    """Short name for tables."""
     overrides: Overrides
-    """What the ablation changes: ``recipe``, ``config.*`` and ``params.*``."""
+    """Settings that the ablation changes: ``recipe``, ``config.*`` and ``params.*``."""
     settings: Settings
 
 
 def overrides_of(tree: Mapping[str, Any], place: str) -> list[tuple[str, Overrides]]:
-    """Return all overrides a specification asks for, each with the name that it was given, or "".
+    """Return all overrides of a specification, each with its given name, or "".
 
     Args:
-        tree: with any of the keys grid, zip, random and list; what they yield is put end to end.
-        place: file name for messages.
+        tree: mapping with any of the keys grid, zip, random and list; their overrides are concatenated.
+        place: file name in messages.
 
     Raises:
         UsageError: there is nothing to compare, or a key holds no values.
@@ -52,14 +52,14 @@ def overrides_of(tree: Mapping[str, Any], place: str) -> list[tuple[str, Overrid
 def variants(
     wanted: Iterable[tuple[str, Overrides]], recipe: str, common: Overrides, folder: Path, place: str
 ) -> list[Variant]:
-    """Resolve overrides into settings; those that are the same are taken once.
+    """Resolve overrides into settings; equal settings are taken once.
 
     Args:
         wanted: names and overrides.
-        recipe: recipe or settings file that they change.
-        common: overrides that hold for all of them.
-        folder: where settings files are looked for first.
-        place: file name for messages.
+        recipe: recipe or settings file to which the overrides apply.
+        common: overrides that apply to all variants.
+        folder: folder in which settings files are looked for first.
+        place: file name in messages.
     """
     wanted = list(wanted)
     paths = list(dict.fromkeys(path for _, overrides in wanted for path in overrides))
@@ -157,7 +157,7 @@ def _drawn(draw: np.random.Generator, given: Any, place: str) -> Any:
 
 _READERS = {"grid": _grid, "zip": _zip, "random": _random, "list": _list}
 KINDS = tuple(_READERS)
-"""The keys that say what is compared."""
+"""Keys of a specification that define what is compared."""
 
 
 def _axes(tree: Any, place: str) -> dict[str, list[Any]]:
@@ -172,7 +172,7 @@ def _axes(tree: Any, place: str) -> dict[str, list[Any]]:
 
 
 def _short_names(paths: list[str]) -> dict[str, str]:
-    """Return the shortest ends of the paths that tell them apart."""
+    """Return the shortest ends of the paths that are unique."""
     short = {}
     for path in paths:
         parts = path.split(".")

@@ -1,1 +1,1 @@
-"""What the command line does, one module each: compose the package's parts and print."""
+"""The commands of the command line, one module for each: compose the package's parts and print results."""

@@ -1,4 +1,4 @@
-"""``lio-jax ablate``: hundreds of runs unattended, compared fairly."""
+"""``lio-jax ablate``: many unattended runs, and a fair comparison of them."""
 
 import sys
 import time
@@ -30,11 +30,11 @@ from lio_jax.settings.settings import Settings
 
 
 def ablate(spec_path: Path, out: Path, scheduler: str, report: bool, retry_failed: bool) -> None:
-    """Run an ablation from the command line, or go on with one.
+    """Run an ablation from the command line, or continue one.
 
     Raises:
         UsageError: the specification is wrong, the folder is taken, or no scheduler answers.
-        LioJaxError: some runs failed, or it was interrupted; what is done is kept.
+        LioJaxError: some runs failed, or the command was interrupted; finished runs are kept.
     """
     spec = load_spec(spec_path)
     tasks = tasks_of(spec)
@@ -63,7 +63,7 @@ def ablate(spec_path: Path, out: Path, scheduler: str, report: bool, retry_faile
 def whole_run(
     sequence: Sequence, settings: Settings, out: Path, source: Source, truth: Trajectory | None
 ) -> dict[str, Any]:
-    """Leave in ``out`` all that ``lio-jax run`` does, what it says in run.log, and return its metrics."""
+    """Write all files of ``lio-jax run`` to ``out``, its messages to run.log, and return its metrics."""
     with (out / "run.log").open("w") as log, redirect_stdout(log), redirect_stderr(log):
         return run_into(sequence, settings, out, source.start, source.scans, truth).metrics
 
@@ -101,7 +101,7 @@ _SAID_EVERY = 0.1
 
 @contextmanager
 def _progress(total: int, ended: int) -> Iterator[Callable[[int, int], None]]:
-    """Yield what shows the progress: a bar on a terminal, else a line at every tenth."""
+    """Yield a function that shows the progress: a bar on a terminal, else a line after every tenth of it."""
     if sys.stderr.isatty():
         with tqdm(total=total, initial=ended, unit="run") as bar:
 

@@ -19,26 +19,26 @@ from lio_jax.imu.allan import NoiseFit, allan_deviation, averaging_factors, fit_
 from lio_jax.settings.settings import settings_from_yaml
 
 MIN_SECONDS = 30.0
-"""Shorter recordings do not tell white noise at an averaging time of 1 s."""
+"""Shortest usable recording, s: a shorter one does not determine white noise at an averaging time of 1 s."""
 
 _SENSORS = (("gyroscope", "gyro", "rad/s"), ("accelerometer", "accel", "m/s^2"))
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """The Allan deviation of one sensor's three axes and what follows from it."""
+    """The Allan deviation of one sensor's three axes, and the noise that follows from it."""
 
     tau: NDArray[np.float64]
-    """(k,) averaging times, s."""
+    """Averaging times, (k,) s."""
     deviation: NDArray[np.float64]
-    """(k, 3) Allan deviation, unit of the signal."""
+    """Allan deviation of each axis, (k, 3), in the unit of the signal."""
     axes: tuple[NoiseFit, ...]
     combined: NoiseFit
-    """Fitted to the mean variance of the axes."""
+    """Fit to the mean variance of the axes."""
 
 
 def calibrate_imu(data: Path, out: Path, plot: Path | None, skip: float) -> None:
-    """Print densities, write them as a settings file, and draw the Allan deviation.
+    """Print the densities, write them as a settings file, and draw the Allan deviation.
 
     Raises:
         UsageError: a negative ``skip``, or file names of the wrong kind.
@@ -83,10 +83,10 @@ def calibrate_imu(data: Path, out: Path, plot: Path | None, skip: float) -> None
 
 
 def imu_of(data: Path) -> ImuData:
-    """Return the inertial samples of a recording, or of a native imu.npz on its own.
+    """Return the inertial samples of a recording, or of a single native imu.npz.
 
     Raises:
-        LioJaxError: there are none, or the file cannot be read.
+        LioJaxError: there are no samples, or the file cannot be read.
     """
     if data.suffix == ".npz" and data.is_file():
         return _from_npz(data)
@@ -98,7 +98,7 @@ def imu_of(data: Path) -> ImuData:
 
 
 def _from_npz(path: Path) -> ImuData:
-    """Read stamp_ns, gyro, accel; or rate_hz instead of stamps, gyro_dps in deg/s, accel_g in g."""
+    """Read stamp_ns, gyro and accel; or rate_hz in place of stamps, gyro_dps in deg/s, accel_g in g."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {key: np.asarray(file[key]) for key in file.files}
@@ -123,7 +123,7 @@ def _from_npz(path: Path) -> ImuData:
 
 
 def _at_rest(imu: ImuData, data: Path, skip: float) -> tuple[ImuData, NDArray[np.float64]]:
-    """Return the longest stretch without gaps, checked to be at rest, and its times from the first sample."""
+    """Return the longest part without gaps, checked to be at rest, and its times from the first sample, s."""
     stamps = imu.stamp_ns
     seconds = np.asarray((stamps - stamps[:1]) * 1e-9, np.float64)
     part = slice(int(np.searchsorted(seconds, skip)), len(seconds))
@@ -154,8 +154,8 @@ def sensor_noise(samples: NDArray[np.float64], seconds: NDArray[np.float64]) -> 
     """Return Allan deviation and fits of a sensor at rest.
 
     Args:
-        samples: (m, 3).
-        seconds: (m,) without gaps.
+        samples: (m, 3) samples of the three axes, in the sensor's unit.
+        seconds: (m,) s, times without gaps.
     """
     duration = float(seconds[-1] - seconds[0])
     interval = duration / (len(seconds) - 1)

@@ -10,7 +10,7 @@ from lio_jax.sim.sequence import SimulatedSequence
 
 
 def demo(out: Path, overwrite: bool) -> None:
-    """Run the default recipe on twelve simulated seconds of driving."""
+    """Run the default recipe on twelve seconds of simulated driving."""
     sequence = SimulatedSequence(world="city", sensor="generic32", duration_s=12.0, imu=ImuModel())
     say("simulating and tracking a 32-beam LiDAR and an IMU on twelve seconds of a city ...")
     run_and_report(sequence, Settings(), out, 0, None, sequence.truth(), overwrite)

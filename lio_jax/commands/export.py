@@ -39,7 +39,7 @@ def export(
 
     Raises:
         UsageError: the path does not fit the format or is taken, or the recording ends before ``start``.
-        LioJaxError: there is nothing to write, or the disk takes no more.
+        LioJaxError: there is nothing to write, or the disk is full or cannot be written.
     """
     if start < 0 or (scans is not None and scans < 1):
         raise UsageError(f"--start must be 0 or more and --scans 1 or more, not {start} and {scans}.")
@@ -110,7 +110,7 @@ def _write_bag(
     layout: str,
     overwrite: bool,
 ) -> int:
-    """Write the bag and the truth beside it, both or nothing."""
+    """Write the bag and its truth files, all of them or nothing."""
     truth = sequence.truth()
     with ExitStack() as stack:
         if truth is not None:
@@ -122,7 +122,7 @@ def _write_bag(
 
 
 def _left_out(out: Path, to: Target, sequence: Sequence) -> list[str]:
-    """Return sentences on what the recording holds and the format does not."""
+    """Return sentences on the data that the recording holds and the format cannot hold."""
     if to != "kitti":
         return []
     has = {"inertial samples": sequence.imu(), "GPS fixes": sequence.gps()}
@@ -134,7 +134,7 @@ def _left_out(out: Path, to: Target, sequence: Sequence) -> list[str]:
 
 
 def _reading_hint(to: Target, first: LidarScan) -> str:
-    """Return the setting without which the times of the points would be taken wrongly."""
+    """Return the setting without which the times of the points would be misunderstood."""
     compensated = first.duration == 0
     if to == "kitti" and not compensated:
         return "--set config.data.compensated=no"

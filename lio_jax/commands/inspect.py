@@ -1,4 +1,4 @@
-"""``lio-jax inspect``: what is in a recording, what is wrong with it, which settings fit."""
+"""``lio-jax inspect``: a recording's contents, its faults, and the settings that fit it."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ from lio_jax.settings.settings import Settings, with_overrides
 def inspect(
     data: Path, assignments: tuple[str, ...], as_json: bool, config: Path | None, overwrite: bool
 ) -> None:
-    """Print what was found as a table, or as one JSON object; write the settings that fit."""
+    """Print the results as a table or as one JSON object, and write the settings that fit."""
     if config is not None and config.exists() and not overwrite:
         raise UsageError(f"{config}: exists; choose another file or add --overwrite.")
     settings = with_overrides(Settings(), assignments)

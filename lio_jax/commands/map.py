@@ -1,4 +1,4 @@
-"""``lio-jax map``: save the map of a run at any resolution."""
+"""``lio-jax map``: write the map of a run at a chosen resolution."""
 
 import math
 from collections.abc import Iterator
@@ -21,11 +21,11 @@ Clouds = Iterator[tuple[NDArray[np.float64], NDArray[np.float32]]]
 
 
 def make_map(folder: Path, out: Path, voxel: float, part: Part, overwrite: bool) -> None:
-    """Write a run's map with one point per voxel, from its keyframes; where it kept none, from its map.pcd.
+    """Write a run's map with one point per voxel, from its keyframes, or from its map.pcd if it kept none.
 
     Raises:
         UsageError: an impossible size or ending, or the file exists.
-        LioJaxError: the folder is no run's, lacks the part asked for, or is damaged.
+        LioJaxError: the folder is not a run's, lacks the requested part, or is damaged.
     """
     check_ending(out)
     if not (math.isfinite(voxel) and voxel >= _FINEST):
@@ -42,7 +42,7 @@ def make_map(folder: Path, out: Path, voxel: float, part: Part, overwrite: bool)
 
 
 def _clouds(folder: Path, part: Part) -> tuple[Clouds, int, str]:
-    """Return poses and points of what the run kept, how many there are, and what they are called."""
+    """Return poses and points of the run's clouds, the number of clouds, and their name for messages."""
     if (folder / FOLDER).is_dir():
         kept = read_keyframes(folder)
         lost = np.sum(~np.isfinite(kept.T_world_imu).all(axis=(1, 2)))
@@ -56,7 +56,7 @@ def _clouds(folder: Path, part: Part) -> tuple[Clouds, int, str]:
         )
     if part != "whole":
         raise LioJaxError(
-            f"{folder}: map.pcd does not tell corners from surfaces, and the run kept no keyframes; take "
+            f"{folder}: map.pcd does not separate corners from surfaces, and the run kept no keyframes; take "
             "--part whole."
         )
     say(f"note: {folder}: the run kept no keyframes; its map.pcd is taken, no finer than it was saved.")

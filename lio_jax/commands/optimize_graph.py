@@ -18,11 +18,11 @@ from lio_jax.pose_graph.pose_graph import compile_for, solve
 from lio_jax.pose_graph.structure import structure_of
 
 _NAMED = 5
-"""So many distrusted edges are named."""
+"""Number of distrusted edges that are named."""
 
 
 def optimize_graph(source: Path, out: Path, robust: bool, as_json: bool) -> None:
-    """Solve the graph, write it with the poses found, and print what it took.
+    """Solve the graph, write it with the solution's poses, and print cost and time.
 
     Raises:
         UsageError: the result would replace the input, or has no folder to go to.

@@ -1,4 +1,4 @@
-"""``lio-jax report``: re-make a run's report, or compare several runs on one page."""
+"""``lio-jax report``: draw a run's report again, or compare several runs on one page."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""``--params-from``: settings from a parameter file of LIO-SAM or FAST-LIO2, and what became of its keys."""
+"""``lio-jax run``: resolve the settings, run a recording into a folder, and print the results."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -24,13 +24,57 @@ from lio_jax.viz.recording import Recording
 from lio_jax.viz.run_recording import RecordingSink
 
 
+def run(
+    data: Path,
+    recipe: str | None,
+    assignments: tuple[str, ...],
+    params_from: Path | None,
+    out: Path,
+    start: int,
+    scans: int | None,
+    gt: Path | None,
+    overwrite: bool,
+    live: bool = False,
+) -> None:
+    """Run one recording from the command line."""
+    if start < 0 or (scans is not None and scans < 1):
+        raise UsageError(f"--start must be 0 or more and --scans 1 or more, not {start} and {scans}.")
+    settings = resolve_settings(recipe, assignments, params_from)
+    sequence = open_sequence(data, settings.run.data)
+    truth = truth_of(sequence, gt)
+    if live and not settings.run.output.recording:
+        raise UsageError("--live shows the recording, and config.output.recording=false leaves it out.")
+    run_and_report(sequence, settings, out, start, scans, truth, overwrite, live)
+
+
+def run_and_report(
+    sequence: Sequence,
+    settings: Settings,
+    out: Path,
+    start: int,
+    count: int | None,
+    truth: Trajectory | None,
+    overwrite: bool,
+    live: bool = False,
+) -> RunResult:
+    """Run a recording into a folder, evaluate against truth, draw, and print a summary.
+
+    Raises:
+        UsageError: the recording ends before ``start``, or the folder may not be written.
+        LioJaxError: nothing could be read, or the run ended early; what was computed is written.
+    """
+    check_start(sequence, start)
+    with run_folder(out, overwrite):
+        return run_into(sequence, settings, out, start, count, truth, live)
+
+
 def beneath_recipe(foreign: ForeignSettings, recipe: str | None, is_file: bool) -> Settings:
-    """Return a recipe's settings with another system's on top, and a settings file's on top of those.
+    """Return the settings of a recipe, overridden by another system's, overridden by a settings file's.
 
     Args:
-        foreign: the other system's.
-        recipe: name or settings file; None: the recipe that stands for the system. So does a file that names
-            none.
+        foreign: settings from the other system's file.
+        recipe: name or settings file; None: the recipe that follows the other system's method. It is also
+            used if the settings file names no recipe.
         is_file: whether ``recipe`` is a file.
 
     Raises:
@@ -44,7 +88,7 @@ def beneath_recipe(foreign: ForeignSettings, recipe: str | None, is_file: bool) 
 
 
 def mapping_table(foreign: ForeignSettings, settings: Settings) -> str:
-    """Write each key of the file with what became of it in a run's settings."""
+    """Return a table of the file's keys, with the effect of each key on a run's settings."""
     system, recipe = foreign.system, settings.recipe
     taken = foreign.taken(recipe)
     left = [entry for entry in foreign.keys if entry not in taken]
@@ -95,12 +139,12 @@ def resolve_settings(
 ) -> Settings:
     """Return the settings of a recipe name or settings file, with ``--set`` applied.
 
-    Another system's parameters lie above the recipe's own values and beneath a settings file's; what became
-    of them is said.
+    Another system's parameters override the recipe's own values, and a settings file's values override them.
+    A printed table lists the parameters that were used.
 
     Args:
-        recipe: name or file; None: default, or the recipe that stands for the other system.
-        assignments: of ``--set``.
+        recipe: name or file; None: default, or the recipe that follows the other system's method.
+        assignments: arguments of ``--set``.
         params_from: parameter file of LIO-SAM or FAST-LIO2.
 
     Raises:
@@ -118,50 +162,6 @@ def resolve_settings(
     if params_from is not None:
         say(mapping_table(foreign, settings))
     return settings
-
-
-def run(
-    data: Path,
-    recipe: str | None,
-    assignments: tuple[str, ...],
-    params_from: Path | None,
-    out: Path,
-    start: int,
-    scans: int | None,
-    gt: Path | None,
-    overwrite: bool,
-    live: bool = False,
-) -> None:
-    """Run one recording from the command line."""
-    if start < 0 or (scans is not None and scans < 1):
-        raise UsageError(f"--start must be 0 or more and --scans 1 or more, not {start} and {scans}.")
-    settings = resolve_settings(recipe, assignments, params_from)
-    sequence = open_sequence(data, settings.run.data)
-    truth = truth_of(sequence, gt)
-    if live and not settings.run.output.recording:
-        raise UsageError("--live shows the recording, and config.output.recording=false leaves it out.")
-    run_and_report(sequence, settings, out, start, scans, truth, overwrite, live)
-
-
-def run_and_report(
-    sequence: Sequence,
-    settings: Settings,
-    out: Path,
-    start: int,
-    count: int | None,
-    truth: Trajectory | None,
-    overwrite: bool,
-    live: bool = False,
-) -> RunResult:
-    """Run a recording into a folder, evaluate against truth, draw, and say what came out.
-
-    Raises:
-        UsageError: the recording ends before ``start``, or the folder may not be written.
-        LioJaxError: nothing could be read, or the run ended early; what was computed is written.
-    """
-    check_start(sequence, start)
-    with run_folder(out, overwrite):
-        return run_into(sequence, settings, out, start, count, truth, live)
 
 
 def run_into(
@@ -212,7 +212,7 @@ def _warn(sentences: list[str]) -> None:
 
 
 def _live_viewer(stack: ExitStack) -> str:
-    """Serve a viewer for as long as the run goes on, and return where to send it what is computed."""
+    """Serve a viewer during the run, and return the address to which results are sent."""
     from lio_jax.viz.viewer import served
 
     server = stack.enter_context(served())
@@ -234,7 +234,7 @@ class _ProgressBar(Sink):
 
 
 def truth_of(sequence: Sequence, gt: Path | None) -> Trajectory | None:
-    """Return the recording's ground truth, or the one that a file holds.
+    """Return the recording's ground truth, or the ground truth in a file.
 
     Raises:
         UsageError: the file has no time stamps.
@@ -245,7 +245,7 @@ def truth_of(sequence: Sequence, gt: Path | None) -> Trajectory | None:
 
     loaded = load_trajectory(gt)
     if not loaded.stamped:
-        raise UsageError(f"{gt}: has no time stamps; give a TUM file, or KITTI poses beside their times.txt.")
+        raise UsageError(f"{gt}: has no time stamps; give a TUM file, or KITTI poses with their times.txt.")
     return loaded.trajectory
 
 
@@ -261,7 +261,7 @@ def _finish(result: RunResult, truth: Trajectory | None, settings: Settings, out
         except LioJaxError as error:
             say(f"warning: no comparison with the truth: {error}")
         else:
-            # the evaluation has notes of its own
+            # the evaluation adds notes of its own
             noted = [*result.metrics["notes"], *evaluation.notes]
             result.metrics |= evaluation.as_dict() | {"notes": noted}
             if result.odometry is not None:

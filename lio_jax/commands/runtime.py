@@ -1,4 +1,4 @@
-"""Process-wide settings of the command line; importing the package itself changes none."""
+"""Process-wide settings of the command line; the import of the package itself changes none."""
 
 import os
 import sys
@@ -8,8 +8,8 @@ from pathlib import Path
 def prepare_jax() -> None:
     """Turn on double precision and the persistent compilation cache.
 
-    The cache lies in $LIO_JAX_CACHE, else $XDG_CACHE_HOME/lio_jax, else ~/.cache/lio_jax; where it cannot be
-    written programs are compiled anew each time.
+    The cache is in $LIO_JAX_CACHE, else in $XDG_CACHE_HOME/lio_jax, else in ~/.cache/lio_jax. If it cannot be
+    written, programs are compiled again each time.
     """
     import jax
 
@@ -27,5 +27,5 @@ def prepare_jax() -> None:
 
 
 def say(line: str) -> None:
-    """Print a line for a person, apart from results on standard output."""
+    """Print a line to standard error, apart from the results on standard output."""
     print(line, file=sys.stderr, flush=True)

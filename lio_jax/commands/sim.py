@@ -29,7 +29,7 @@ from lio_jax.sim.sensors import find_sensor
 from lio_jax.sim.sequence import SimulatedSequence
 
 _DURATION = 60.0
-"""Unless asked otherwise or set by a trajectory, s."""
+"""Default duration, unless a trajectory sets it, s."""
 
 
 def sim(
@@ -71,13 +71,13 @@ def sim(
 
 
 def truth_beside(bag: Path) -> tuple[Path, Path]:
-    """Return where the truth of a bag lies: poses as TUM, everything else as npz."""
+    """Return the paths of a bag's truth: a TUM file for the poses, an .npz file for everything else."""
     stem = bag.stem if bag.suffix in FORMAT_OF_ENDING else bag.name
     return bag.with_name(f"{stem}.truth.tum"), bag.with_name(f"{stem}.truth.npz")
 
 
 def _check_output(out: Path, chosen: Format, overwrite: bool) -> None:
-    """Refuse at once what would be refused after a long simulation."""
+    """Refuse an impossible output at once, not after a long simulation."""
     if chosen == "native":
         if out.suffix in FORMAT_OF_ENDING:
             raise UsageError(f"{out}: a native recording is a folder; leave out the ending or the format.")
@@ -154,9 +154,7 @@ def _trajectory(path: Path | None) -> Trajectory | None:
 
     loaded = load_trajectory(path)
     if not loaded.stamped:
-        raise UsageError(
-            f"{path}: has no time stamps; give a TUM file, or KITTI poses beside their times.txt."
-        )
+        raise UsageError(f"{path}: has no time stamps; give a TUM file, or KITTI poses with their times.txt.")
     return loaded.trajectory
 
 
@@ -175,7 +173,7 @@ def _write_bag(
     layout: str,
     overwrite: bool,
 ) -> int:
-    """Write the bag and its truth, all of it or nothing."""
+    """Write the bag and its truth, all files or none."""
     poses, arrays = truth_beside(out)
     with ExitStack() as stack:
         write_tum(stack.enter_context(written_whole(poses, overwrite)), sequence.truth())

@@ -1,4 +1,4 @@
-"""What ``lio-jax sim`` can be asked for, apart from world, sensor, length and seed; loads nothing heavy."""
+"""Options of ``lio-jax sim`` apart from world, sensor, length and seed; imports nothing heavy."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +26,7 @@ class MotionOptions:
 
 @dataclass(frozen=True)
 class SensorOptions:
-    """Which sensors there are, and where the LiDAR sits."""
+    """The sensors of the recording, and the pose of the LiDAR."""
 
     imu_rate: Annotated[float, arg(metavar="HZ")] = 200.0
     """Inertial samples per second; 0 leaves the IMU out."""
@@ -40,24 +40,24 @@ class SensorOptions:
 
 @dataclass(frozen=True)
 class ErrorOptions:
-    """The sensors' errors; None means the sensor's usual."""
+    """Errors of the sensors; None means the sensor's usual error."""
 
     range_noise: Number = None
     """Standard deviation of a range, m."""
     gyro_noise: Number = None
-    """Density, rad/s/sqrt(Hz)."""
+    """White noise density, rad/s/sqrt(Hz)."""
     accel_noise: Number = None
-    """Density, m/s^2/sqrt(Hz)."""
+    """White noise density, m/s^2/sqrt(Hz)."""
     gyro_bias_walk: Number = None
-    """Density, rad/s^2/sqrt(Hz)."""
+    """Random-walk density, rad/s^2/sqrt(Hz)."""
     accel_bias_walk: Number = None
-    """Density, m/s^3/sqrt(Hz)."""
+    """Random-walk density, m/s^3/sqrt(Hz)."""
     gyro_bias_sigma: Number = None
-    """Spread of the initial bias, rad/s."""
+    """Standard deviation of the initial bias, rad/s."""
     accel_bias_sigma: Number = None
-    """Spread of the initial bias, m/s^2."""
+    """Standard deviation of the initial bias, m/s^2."""
     time_offset: Number = None
-    """Inertial stamps are late by this, s."""
+    """Delay of the inertial stamps, s."""
     gps_noise: Number = None
     """Standard deviation of a fix along each axis, m."""
     gps_multipath: Number = None

@@ -1,4 +1,4 @@
-"""``lio-jax tune``: parameters by gradient, on recordings of one's own."""
+"""``lio-jax tune``: optimise parameters by gradient on the user's recordings."""
 
 import math
 from collections.abc import Iterator
@@ -28,14 +28,14 @@ from lio_jax.tuning.values import StreamingValues
 Optimiser = Literal["auto", "scoring", "lbfgsb", "adam"]
 
 FACTOR = 1000.0
-"""How far a positive parameter may move from its start, as a factor."""
+"""Largest change of a positive parameter from its start, as a factor."""
 TURN, SHIFT, LAG = math.radians(20), 0.5, 0.1
-"""How far an extrinsic may move from its start: rad, m; and the time offset, s."""
+"""Largest change of the extrinsics from their start, rotation (rad), translation (m), and of the lag (s)."""
 
 
 @dataclass(frozen=True)
 class TuneOptions:
-    """What ``lio-jax tune`` is told beside the recordings."""
+    """Options of ``lio-jax tune`` apart from the recordings."""
 
     recipe: str | None
     assignments: tuple[str, ...]
@@ -55,11 +55,11 @@ class TuneOptions:
 def tune(
     data: tuple[Path, ...], validate: tuple[Path, ...], gt: Path | None, out: Path, options: TuneOptions
 ) -> None:
-    """Tune from the command line and leave tuned.yaml, history.json and tuning.png behind.
+    """Tune from the command line and write tuned.yaml, history.json and tuning.png.
 
     Raises:
         UsageError: unknown parameters or objective, or truth is needed and missing.
-        LioJaxError: a recording can't be read, or the objective is not finite at the start.
+        LioJaxError: a recording cannot be read, or the objective is not finite at the start.
     """
     _check(options, data, gt)
     named = objective_named(options.objective)
@@ -90,7 +90,7 @@ def tune(
         lambda iterate: _report(free, iterate),
     )
     if session.history:
-        say(f"note: going on after {len(session.history)} evaluations that {out / HISTORY} holds.")
+        say(f"note: continuing after {len(session.history)} evaluations in {out / HISTORY}.")
     first = np.asarray(free.first())
     with _interruptible(session, out):
         session.run(optimiser, first, _bounds(free, first), options.iterations, options.seed)
@@ -109,7 +109,7 @@ def _check(options: TuneOptions, data: tuple[Path, ...], gt: Path | None) -> Non
         )
     if options.segment is not None and options.segment < 20:
         raise UsageError(
-            f"--segment must be 20 scans or more, not {options.segment}: less tells of the start only."
+            f"--segment must be 20 scans or more, not {options.segment}: a shorter one shows the start only."
         )
     if gt is not None and len(data) > 1:
         raise UsageError("--gt goes with one recording; several have to bring their own truth.")
@@ -123,7 +123,7 @@ def _recordings(
     options: TuneOptions,
     segment: int | None,
 ) -> tuple[Settings, list[Recording]]:
-    """Return the recordings, or their consecutive segments, and settings with the first one's extrinsics."""
+    """Return the recordings or their consecutive segments, and settings with the first one's extrinsics."""
     recordings: list[Recording] = []
     for path in paths:
         sequence = open_sequence(path, settings.run.data)
@@ -165,7 +165,7 @@ def _prepare(out: Path, overwrite: bool) -> None:
 
 @contextmanager
 def _interruptible(session: Session, out: Path) -> Iterator[None]:
-    """Keep what was computed when Ctrl-C comes, unless nothing was."""
+    """On Ctrl-C keep the results so far, if there are any."""
     try:
         yield
     except KeyboardInterrupt:
@@ -188,7 +188,7 @@ def _report(free: ParameterVector, iterate: Iterate) -> None:
 
 
 def _shown(free: ParameterVector, iterate: Iterate) -> dict[str, float]:
-    """Return the components in their own units: exp of those on a log scale."""
+    """Return the components in their own units: exp of the components on a log scale."""
     return {
         name: value if name.startswith("extrinsics.") else math.exp(value)
         for name, value in zip(free.names, iterate.x, strict=True)
@@ -196,7 +196,7 @@ def _shown(free: ParameterVector, iterate: Iterate) -> dict[str, float]:
 
 
 def _interval(free: ParameterVector, iterate: Iterate) -> dict[str, tuple[float, float]]:
-    """Return each component's 95 % interval where it is known."""
+    """Return each component's 95 % interval, where it is known."""
     if iterate.sigma is None:
         return {}
     intervals = {}

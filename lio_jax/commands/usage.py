@@ -1,8 +1,8 @@
-"""Say in one sentence what is wrong with a command line, where tyro would draw a box.
+"""Describe a wrong command line in one sentence, where tyro would print a box.
 
-The one place that knows what tyro tells of a refused command line. That is no part of its public interface,
-hence the bound on its version in pyproject.toml; without it, and for events not known here, its own words are
-printed.
+This is the only module that knows how tyro reports a refused command line. That report is not part of tyro's
+public interface, hence the bound on its version in pyproject.toml. For other versions and for unknown events,
+tyro's own words are printed.
 """
 
 import dataclasses
@@ -23,11 +23,11 @@ _POSITIONAL = get_args(tyro.conf.Positional[int])[1]
 
 @contextmanager
 def usage_in_a_sentence(words: Sequence[str], app: tyro.extras.SubcommandApp) -> Iterator[None]:
-    """Raise a sentence for what tyro refuses within the block.
+    """Raise one sentence for words that tyro refuses within the block.
 
     Args:
         words: the command line.
-        app: that reads it in the block.
+        app: the application that reads the words in the block.
 
     Raises:
         UsageError: tyro refused the words.
@@ -47,7 +47,7 @@ def usage_in_a_sentence(words: Sequence[str], app: tyro.extras.SubcommandApp) ->
 
 
 def _usage_error(event: Any, words: Sequence[str], commands: Mapping[str, Any]) -> str:
-    """Return one sentence about an event of tyro's, "" where it is of a kind not known here."""
+    """Return one sentence on an event of tyro's; return "" for an event of an unknown kind."""
     command = next((word for word in words if word in commands), "")
     if not command:
         return _wrong_command(words, commands)
@@ -118,20 +118,20 @@ def _unknown_option(unknown: str, options: Mapping[str, Any]) -> str:
 
 
 def _nearest_option(unknown: str, options: Sequence[str]) -> str:
-    # dashes left out: all options would be alike by them
+    # without the dashes, which make all options similar
     names = {option.lstrip("-"): option for option in options}
     close = difflib.get_close_matches(unknown.partition("=")[0].lstrip("-"), names, 1)
     return names[close[0]] if close else ""
 
 
 def _shown(argument: Any) -> str:
-    """Write an argument as its help does: DATA, or --out DIR."""
+    """Return an argument as its help writes it: DATA, or --out DIR."""
     metavar = str(argument.lowered.metavar)
     return metavar if argument.is_positional() else f"{argument.lowered.name_or_flags[-1]} {metavar}"
 
 
 def _wanted(kind: Any) -> str:
-    """Say what an option's value has to be; "" where that is not known here."""
+    """Return words for the value that an option needs; return "" where this is not known."""
     alternatives = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
     for alternative in alternatives:
         if get_origin(alternative) is Literal:
@@ -144,7 +144,7 @@ def _wanted(kind: Any) -> str:
 
 
 def _given(name: str, words: Sequence[str], argument: Any) -> str:
-    """Return the value or values that the words give an option."""
+    """Return the value or values that the words give for an option."""
     count = len(str(argument.lowered.metavar).split())
     given = ""
     for place, word in enumerate(words, 1):

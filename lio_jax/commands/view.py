@@ -8,7 +8,7 @@ from lio_jax.viz.viewer import served, show
 
 
 def view(path: Path, web: bool) -> None:
-    """Show a run folder or an .rrd in a window, or serve it to a browser until Ctrl-C."""
+    """Show a run folder or an .rrd file in a window, or serve it to a browser until Ctrl-C."""
     recording = path / "recording.rrd" if path.is_dir() else path
     if not recording.is_file():
         raise UsageError(f"{recording}: is not there; give a folder that lio-jax run wrote, or an .rrd.")

@@ -1,4 +1,4 @@
-"""Recordings: one protocol, one function that opens any of them."""
+"""Recordings: one protocol for all formats, and one function that opens any of them."""
 
 from lio_jax.data.detect import open_sequence
 from lio_jax.data.native_writer import write_native

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class RosHeader(NamedTuple):
-    """Stamp of a message, and where its body starts."""
+    """Stamp of a message, and the place where its body starts."""
 
     stamp_ns: int
     body: int
@@ -66,24 +66,24 @@ class Topic:
 
 @dataclass(frozen=True)
 class BagContents:
-    """What a bag says about itself without any scan being decoded."""
+    """What a bag's index states, without decoding any scan."""
 
     topics: tuple[Topic, ...]
     lidar: Topic
     """The topic whose clouds are read."""
     imu: Topic | None
     point_fields: tuple[str, ...]
-    """Name and type of the fields of a point, as the first cloud has them."""
+    """Name and type of each field of a point, taken from the first cloud."""
     size_bytes: int
-    """Of all its files."""
+    """Total size of the bag's files, bytes."""
     start_ns: int
-    """When its first message was received."""
+    """When the first message was received, ns."""
     end_ns: int
-    """When its last message was received."""
+    """When the last message was received, ns."""
 
 
 def bag_topics(connections: Iterable[Any]) -> tuple[Topic, ...]:
-    """Sum a bag's connections by topic and type, in order of name."""
+    """Sum a bag's connections by topic and type, sorted by name."""
     counts: dict[tuple[str, str], int] = {}
     for connection in connections:
         key = (connection.topic, connection.msgtype)
@@ -94,14 +94,15 @@ def bag_topics(connections: Iterable[Any]) -> tuple[Topic, ...]:
 def choose_topic(
     path: Path, topics: tuple[Topic, ...], key: str, wanted: str, types: Mapping[str, str]
 ) -> tuple[Topic | None, str]:
-    """Return the topic to read, and a note where there was a choice.
+    """Return the topic to read, and a note if other topics could have been read.
 
     Args:
-        path: of the bag, for messages.
-        topics: all of the bag's.
-        key: of the setting that names the topic, such as "lidar_topic".
-        wanted: that setting; "" takes the topic with most messages among those of the right type.
-        types: message type -> what it is called in a message.
+        path: path of the bag, for messages.
+        topics: all topics of the bag.
+        key: key of the setting that names the topic, for example "lidar_topic".
+        wanted: value of that setting; "" takes the topic with the most messages among those of the right
+            type.
+        types: name in messages of each accepted message type.
 
     Raises:
         LioJaxError: ``wanted`` is not in the bag, or is of another type.
@@ -177,7 +178,7 @@ def bag_paths(path: Path) -> tuple[Path, ...]:
 
 @contextmanager
 def open_bag(paths: Sequence[Path]) -> Iterator["AnyReader"]:
-    """Open the files of one recording as a rosbags AnyReader and close them at the end of the block.
+    """Open the files of one recording as a rosbags AnyReader, and close them at the end of the block.
 
     Raises:
         LioJaxError: a file is damaged, unfinished or of a kind that rosbags cannot read.
@@ -190,7 +191,7 @@ def open_bag(paths: Sequence[Path]) -> Iterator["AnyReader"]:
     try:
         reader = AnyReader(list(paths), default_typestore=typestore)
         reader.open()
-    # Damaged files make the index and codec libraries raise whatever they stumble over.
+    # On damaged files the index and codec libraries raise many kinds of exceptions.
     except Exception as error:
         raise LioJaxError(_why_unreadable(paths, error)) from error
     try:
@@ -200,13 +201,13 @@ def open_bag(paths: Sequence[Path]) -> Iterator["AnyReader"]:
 
 
 def until_damage(messages: Iterator[Any], report: Callable[[str], None]) -> Iterator[Any]:
-    """Yield messages; where the bag turns out to be damaged, report the reason and end."""
+    """Yield messages; if the bag turns out to be damaged, report the reason and stop."""
     while True:
         try:
             message = next(messages)
         except StopIteration:
             return
-        # As on opening: rosbags, sqlite, lz4 and zstd each raise their own kinds on damaged data.
+        # As on opening: rosbags, sqlite, lz4 and zstd raise exceptions of different kinds on damaged data.
         except Exception as error:
             report(_reason(error))
             return
@@ -232,7 +233,7 @@ def _check_magic(files: Sequence[Path]) -> None:
 
 
 def _why_unreadable(paths: Sequence[Path], error: Exception) -> str:
-    """Find the file at fault by opening each one alone."""
+    """Return a sentence that names the file at fault, which is found by opening each file alone."""
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
 

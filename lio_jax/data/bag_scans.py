@@ -1,4 +1,4 @@
-"""From a point-cloud message to a LidarScan, after a look at the first messages of the topic."""
+"""Turn point-cloud messages into LidarScans, after recognising the layout from a topic's first messages."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -42,24 +42,24 @@ def decode_cloud(reader: "AnyReader", topic: Topic, raw: bytes, time_field: str,
 
 @dataclass(frozen=True)
 class ScanReading:
-    """How a topic's clouds become scans; the same for all of its scans."""
+    """How a topic's clouds become scans; all scans of the topic share it."""
 
     timing: PointTiming | None
-    """None where time is reconstructed from azimuth, or the points are motion compensated."""
+    """Meaning of the point times; None where they are reconstructed or the points are motion compensated."""
     stamp_at: Literal["start", "end"]
-    """Where the header stamp lies if ``timing`` is None."""
+    """Which end of the scan the header stamp marks if ``timing`` is None."""
     sweep: float
     """Usual duration of a scan, s; 0 where points are motion compensated."""
     beams: int
-    """For reconstruction; 0 where messages hold the ring."""
+    """Number of beams for the reconstruction of rings; 0 where messages hold the ring."""
     notes: tuple[str, ...]
 
     def scan(self, cloud: RawCloud, name: str, warn: Callable[[str], None]) -> LidarScan:
-        """Place a decoded cloud in time and complete it.
+        """Place a decoded cloud in time and fill in what it lacks.
 
         Args:
-            cloud: decoded message.
-            name: how a warning calls the scan.
+            cloud: the decoded message.
+            name: the scan's name in warnings.
             warn: called with one sentence for each problem.
         """
         start_ns, time, duration, keep = self._times(cloud, name, warn)
@@ -99,14 +99,14 @@ def recognise_scans(
     config: DataConfig,
     where: str,
 ) -> ScanReading:
-    """Settle how the topic's clouds are read from its first scans that hold points.
+    """Settle from the topic's first scans with points how its clouds are read.
 
     Args:
-        reader: open bag.
-        topic: of the point clouds.
-        messages: (connection, receipt ns, bytes) of the topic, in order.
-        config: overrides.
-        where: bag and topic, for errors.
+        reader: the open bag.
+        topic: the topic of the point clouds.
+        messages: (connection, receipt time in ns, bytes) of each message of the topic, in order.
+        config: settings that override what is recognised.
+        where: name of bag and topic in errors.
 
     Raises:
         LioJaxError: the layout cannot be used, or no message can be decoded.

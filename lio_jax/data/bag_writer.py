@@ -26,24 +26,24 @@ if TYPE_CHECKING:
 BagFormat = Literal["ros1", "ros2-sqlite3", "ros2-mcap"]
 
 FORMAT_OF_ENDING: dict[str, BagFormat] = {".bag": "ros1", ".db3": "ros2-sqlite3", ".mcap": "ros2-mcap"}
-"""What the ending of a bag's name tells."""
+"""Bag format that belongs to each ending of a bag's name."""
 
 _ENDINGS: dict[str, tuple[str, ...]] = {
     "ros1": (".bag",),
     "ros2-sqlite3": (".db3", ""),
     "ros2-mcap": (".mcap", ""),
 }
-"""Of a path that each format may be written to; "" stands for a folder."""
+"""Endings of the paths that each format may be written to; "" stands for a folder."""
 
 _RECORDING = "recording"
-"""Of the storage file in a ROS 2 bag: always the same, so that the bytes do not depend on where they lie."""
+"""Name of the storage file in a ROS 2 bag; it is constant, so that the bytes do not depend on the path."""
 
 _ROS2_VERSION: Literal[8] = 8
-"""Newest metadata that ROS 2 Humble as well as its successors can read."""
+"""Newest metadata version that ROS 2 Humble and its successors can read."""
 
 
 def check_ending(path: Path, bag_format: BagFormat) -> None:
-    """Refuse a path by whose ending a reader would expect another format.
+    """Refuse a path whose ending makes readers expect another format.
 
     Raises:
         UsageError: the ending belongs to another format, or ROS 1 is asked for without ".bag".
@@ -62,17 +62,17 @@ def check_ending(path: Path, bag_format: BagFormat) -> None:
 def new_bag(
     path: Path, bag_format: BagFormat, typestore: Any, overwrite: bool
 ) -> Iterator[Callable[[Message], None]]:
-    """Yield the function that stores a message; the bag appears whole when the block ends well.
+    """Yield a function that stores a message; the complete bag appears when the block ends without error.
 
     Args:
-        path: file, or folder for a ROS 2 bag with its metadata.yaml.
-        bag_format: container.
-        typestore: rosbags definitions of the messages.
-        overwrite: replace a bag that is there.
+        path: path of the file, or of the folder of a ROS 2 bag with its metadata.yaml.
+        bag_format: format of the bag.
+        typestore: rosbags' definitions of the messages.
+        overwrite: whether an existing bag is replaced.
 
     Raises:
         UsageError: ``path`` is taken or does not fit the format.
-        LioJaxError: the disk takes no more.
+        LioJaxError: the disk is full or cannot be written.
     """
     check_ending(path, bag_format)
     is_file = bool(path.suffix) and path.suffix in _ENDINGS[bag_format]
@@ -84,7 +84,7 @@ def new_bag(
         folder = made.parent / _RECORDING
         with _ros2_writer(folder, bag_format, typestore) as store:
             yield store
-        # the file describes itself; without the folder's metadata.yaml it can be played as well
+        # the file describes itself: it can be played without the folder's metadata.yaml
         os.replace(folder / f"{_RECORDING}{path.suffix}" if is_file else folder, made)
 
 
@@ -128,7 +128,7 @@ def _storing(writer: Any, connect: Callable[[str, str], Any]) -> Callable[[Messa
 
 
 def _latched() -> "Qos":
-    """Return the quality of service of /tf_static: whoever subscribes later still gets it."""
+    """Return the quality of service of /tf_static: a later subscriber still gets the message."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
     unlimited = QosTime(0, 0)
@@ -174,25 +174,29 @@ _LIVOX = np.dtype(
 )
 
 _LIVOX_SINGLE_RETURN = 0x10
-"""Tag of a point with one return and no doubt about it."""
+"""Tag of a point with one certain return."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How one make of LiDAR appears in a bag."""
+    """How the messages of one make of LiDAR appear in a bag."""
 
     points: Callable[[LidarScan], NDArray[Any]]
-    """Packs a scan into the driver's structured array, (n,)."""
+    """Function that packs a scan into the driver's structured array, (n,)."""
     cloud_topic: str
+    """Topic of the point clouds."""
     imu_topic: str
+    """Topic of the inertial samples."""
     lidar_frame: str
+    """Name of the lidar's frame."""
     imu_frame: str
+    """Name of the IMU's frame."""
     custom: bool = False
     """True where the driver publishes Livox's CustomMsg instead of a PointCloud2."""
 
 
 def layout_named(name: str) -> Layout:
-    """Return a driver's layout.
+    """Return the layout of a driver.
 
     Raises:
         UsageError: the name is unknown.
@@ -203,17 +207,17 @@ def layout_named(name: str) -> Layout:
 
 
 def velodyne_points(scan: LidarScan) -> NDArray[Any]:
-    """Pack as velodyne_pointcloud does: ring uint16, time float32 s, 22 bytes a point."""
+    """Pack a scan as velodyne_pointcloud does: ring uint16, time float32 s, 22 bytes a point."""
     cloud = _with_positions(_VELODYNE, scan)
     cloud["intensity"], cloud["ring"], cloud["time"] = scan.intensity, scan.ring, scan.time
     return cloud
 
 
 def ouster_points(scan: LidarScan) -> NDArray[Any]:
-    """Pack as ouster_ros does: t uint32 ns, range in mm, 48 bytes a point.
+    """Pack a scan as ouster_ros does: t uint32 ns, range in mm, 48 bytes a point.
 
     ``ring`` has 8 bits, as FAST-LIO2 and LIO-SAM declare it (PCL leaves a field of another type empty). The
-    cloud is not organised: firings without a return are left out.
+    cloud is not organised: it holds no firings without a return.
     """
     cloud = _with_positions(_OUSTER, scan)
     cloud["intensity"], cloud["t"], cloud["ring"] = scan.intensity, _nanoseconds(scan.time), scan.ring
@@ -223,7 +227,7 @@ def ouster_points(scan: LidarScan) -> NDArray[Any]:
 
 
 def livox_points(scan: LidarScan) -> NDArray[Any]:
-    """Pack as the elements of Livox's CustomMsg: offset_time uint32 ns, reflectivity rounded to 8 bits."""
+    """Pack a scan as Livox's CustomMsg does: offset_time uint32 ns, reflectivity rounded to 8 bits."""
     cloud = _with_positions(_LIVOX, scan)
     cloud["offset_time"], cloud["line"], cloud["tag"] = (
         _nanoseconds(scan.time),
@@ -239,7 +243,7 @@ LAYOUTS = {
     "ouster": Layout(ouster_points, "/os_cloud_node/points", "/os_cloud_node/imu", "os_sensor", "os_imu"),
     "livox": Layout(livox_points, "/livox/lidar", "/livox/imu", "livox_frame", "livox_imu", custom=True),
 }
-"""By make, as a simulated sensor names its own."""
+"""Layouts by the name of the make, as simulated sensors state it."""
 
 
 def _with_positions(layout: np.dtype[Any], scan: LidarScan) -> NDArray[Any]:
@@ -257,7 +261,7 @@ TRUTH_TOPIC = "/ground_truth"
 GPS_TOPIC = "/gps/fix"
 
 _LATENCY_NS = 5_000_000
-"""From a scan's end to its receipt."""
+"""Time from a scan's end to its receipt, ns."""
 
 
 def write_bag(
@@ -269,24 +273,24 @@ def write_bag(
     scans: Iterable[LidarScan] | None = None,
     overwrite: bool = False,
 ) -> int:
-    """Write a bag and return its number of scans; scans are streamed, never held together.
+    """Write a bag and return its number of scans (scans are streamed).
 
-    Clouds and inertial samples lie on the topics of the LiDAR's driver, fixes on /gps/fix, the truth
-    (PoseStamped of T_world_imu) on /ground_truth and T_imu_lidar on /tf_static. A cloud is stamped with its
-    scan's start and received after its end. Messages lie in the order of receipt; the same input gives the
+    Clouds and inertial samples go to the topics of the LiDAR's driver, fixes to /gps/fix, the truth
+    (PoseStamped of T_world_imu) to /ground_truth, and T_imu_lidar to /tf_static. A cloud is stamped with its
+    scan's start and received after its end. Messages are in order of receipt. The same input gives the
     same bytes.
 
     Args:
-        path: of the .bag, .db3 or .mcap file, or of the folder of a ROS 2 bag.
-        sequence: what to write; fixes need a geodetic origin.
-        bag_format: container.
+        path: path of the .bag, .db3 or .mcap file, or of the folder of a ROS 2 bag.
+        sequence: the recording to write; fixes need a geodetic origin.
+        bag_format: format of the bag.
         layout: make of the LiDAR: velodyne, ouster or livox.
-        scans: in place of the sequence's own, such as the same under a progress bar.
-        overwrite: replace a bag that is there.
+        scans: scans to write in place of the sequence's own, for example the same scans with a progress bar.
+        overwrite: whether an existing bag is replaced.
 
     Raises:
         UsageError: ``path`` is taken or does not fit the format, or the layout is unknown.
-        LioJaxError: there are no scans, or the disk takes no more.
+        LioJaxError: there are no scans, or the disk is full or cannot be written.
     """
     driver = layout_named(layout)
     messages = RosMessages(ros2=bag_format != "ros1")

@@ -1,4 +1,4 @@
-"""Pick the reader of a recording from what its path looks like."""
+"""Choose the reader of a recording by the layout of its path."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -25,7 +25,7 @@ def open_sequence(path: Path | str, config: DataConfig | None = None) -> Sequenc
     Args:
         path: a KITTI odometry sequence folder, a KITTI raw drive folder, a ROS 1 or ROS 2 bag, or a native
             folder.
-        config: how it is read; None: the defaults, everything recognised from the data.
+        config: how the recording is read; None: the defaults, which recognise everything from the data.
 
     Raises:
         LioJaxError: nothing is there, the layout is not known, or the reader finds it broken.

@@ -1,17 +1,17 @@
-"""Positions on the earth as local east, north and up."""
+"""Positions on the earth as local east, north and up coordinates."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 MERCATOR_RADIUS = 6_378_137.0
-"""Earth radius of the devkit's convertOxtsToPose, m."""
+"""Earth radius that the devkit's convertOxtsToPose uses, m."""
 
 
 def mercator_positions(geodetic: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (n, 3) east, north, up in m by the devkit's Mercator projection.
 
     x = s r pi lon / 180, y = s r ln tan(pi (90 + lat) / 360), z = alt, with s = cos(pi lat_0 / 180) of the
-    first fix; not relative to any origin.
+    first fix. The positions are not relative to any origin.
 
     Args:
         geodetic: (n, 3) latitude deg, longitude deg, altitude m.
@@ -61,8 +61,8 @@ def geodetic_to_enu(geodetic: NDArray[np.float64], origin: tuple[float, float, f
 def enu_to_geodetic(position: NDArray[np.float64], origin: tuple[float, float, float]) -> NDArray[np.float64]:
     """Return (n, 3) latitude deg, longitude deg, height m of local positions.
 
-    The inverse of :func:`geodetic_to_enu`, away from the poles; latitude by fixed-point iteration, which
-    gains more than two digits a round.
+    This is the inverse of :func:`geodetic_to_enu`, away from the poles. The latitude comes from a fixed-point
+    iteration, which gains more than two digits in each round.
 
     Args:
         position: (n, 3) east, north, up in m from ``origin``.
@@ -82,7 +82,7 @@ def enu_to_geodetic(position: NDArray[np.float64], origin: tuple[float, float, f
 
 
 def _axes(origin: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Return east, north and up at ``origin`` as the columns of a matrix, earth-centred."""
+    """Return the unit vectors east, north and up at ``origin``, earth-centred, as the columns of a matrix."""
     latitude, longitude = np.radians(origin[:2])
     east = [-np.sin(longitude), np.cos(longitude), 0.0]
     up = [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]

@@ -1,4 +1,4 @@
-"""GPS fixes made safe to use: finite, ascending in time, each with a covariance; and what was wrong."""
+"""Checked GPS fixes: finite, ascending in time, each with a covariance; and sentences on what was wrong."""
 
 from dataclasses import replace
 
@@ -10,25 +10,25 @@ from lio_jax.data.sequence import GpsData
 from lio_jax.data.time_order import ascending
 
 _UNSTATED_SIGMA = (5.0, 5.0, 10.0)
-"""m, east north up: of a plain receiver, where the recording states no covariance."""
+"""Assumed standard deviations where the recording states no covariance: those of a plain receiver, m, ENU."""
 _ROUNDING = 1e-3
-"""Of a covariance's trace: so far off symmetric it may be."""
+"""Largest accepted asymmetry of a covariance, as a share of its trace."""
 _FARTHEST = 1e6
-"""m; a position farther from the frame's origin is a fault of the recording."""
+"""A position farther than this from the frame's origin is a fault of the recording, m."""
 
 
 def cleaned(gps: GpsData, source: str) -> tuple[GpsData, tuple[str, ...]]:
-    """Drop fixes that cannot be used, give each a covariance, and say what was done.
+    """Drop fixes that cannot be used, give each one a covariance, and report the changes.
 
-    Dropped are positions that are not finite or impossibly far, (0, 0) of a receiver that has no frame yet,
-    and stamps that repeat or step back. A covariance that is none stands for an unknown one.
+    A fix is dropped if its position is not finite or impossibly far away, if it is at (0, 0) because the
+    receiver has no frame yet, or if its stamp repeats or steps back. An invalid covariance counts as unknown.
 
     Args:
-        gps: in recorded order.
-        source: what the sentences begin with: file or topic.
+        gps: fixes in recorded order.
+        source: file or topic, with which the sentences begin.
 
     Raises:
-        LioJaxError: stamps, positions and covariances are not of one length.
+        LioJaxError: stamps, positions and covariances differ in length.
     """
     count = len(gps.stamp_ns)
     if gps.position.shape != (count, 3) or gps.covariance.shape != (count, 3, 3):
@@ -60,12 +60,13 @@ def cleaned(gps: GpsData, source: str) -> tuple[GpsData, tuple[str, ...]]:
 
 
 def with_covariances(covariance: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
-    """Put a plain receiver's covariance in place of what is none, and say so; "" where all are stated.
+    """Replace invalid covariances by a plain receiver's, and return a sentence on it; "" where all are valid.
 
-    None is what is not finite, not symmetric or not positive definite, such as zeros.
+    A covariance is invalid if it is not finite, not symmetric or not positive definite, for example all
+    zeros.
 
     Args:
-        covariance: (n, 3, 3) m^2, east north up.
+        covariance: (n, 3, 3) m^2, east, north, up.
     """
     finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
     own = np.where(finite[:, None, None], covariance, 0.0)

@@ -1,4 +1,4 @@
-"""Units and plausibility of inertial samples, and what is dropped from them."""
+"""Checks of the units and the plausibility of inertial samples, and the rules for dropping samples."""
 
 from bisect import bisect_left
 from dataclasses import replace
@@ -9,19 +9,63 @@ from numpy.typing import NDArray
 from lio_jax.data.config import DataConfig
 from lio_jax.data.sequence import ImuData
 
+GAP_FACTOR = 5.0
+"""An interval longer than this multiple of the median interval is a gap."""
+LARGEST = 1e5
+"""A reading above this is a fault of the recording in any unit: 10,000 g in m/s^2."""
+_NAMED_AT_MOST = 3
+_LATE_S = 0.1
+
+
+def cleaned(
+    imu: ImuData, source: str, T_imu_lidar: NDArray[np.float64] | None = None
+) -> tuple[ImuData, tuple[str, ...]]:
+    """Drop samples that cannot be used, convert units, and report the changes and the suspicions.
+
+    Samples are dropped if they are not finite or impossibly large, if they repeat a stamp, or if they step
+    back in time. If time steps back, the longest subsequence with ascending time is kept; of several the
+    earliest one. An accelerometer in g is converted. Gaps, saturation, a gyroscope in deg/s and a specific
+    force that points down at rest are reported only. Sentences state times in s from the recording's first
+    sample.
+
+    Args:
+        imu: samples in recorded order.
+        source: file or topic, with which the sentences begin.
+        T_imu_lidar: (4, 4) pose of the lidar in the IMU frame, whose z axis is taken as up; None: the IMU's.
+    """
+
+    origin = int(imu.stamp_ns[0]) if len(imu.stamp_ns) else 0
+    said: list[str] = []
+    imu = _only(imu, _finite(imu, said))
+    imu = _only(imu, _ascending(imu.stamp_ns, origin, said))
+    if len(imu.stamp_ns) == 0:
+        return imu, tuple(f"{source}: {sentence}" for sentence in [*said, "no IMU sample is left."])
+    scale, note = accel_scale(imu.accel, DataConfig())
+    imu = replace(imu, accel=imu.accel * scale)
+    seconds = np.asarray((imu.stamp_ns - origin) * 1e-9, np.float64)
+    said += [
+        f"{note}." if note else "",
+        gaps(imu.stamp_ns, origin),
+        *saturation(imu, seconds),
+        degrees_suspected(imu, seconds),
+        gravity_sign(imu, seconds, T_imu_lidar),
+    ]
+    return imu, tuple(f"{source}: {sentence}" for sentence in said if sentence)
+
+
 STANDARD_GRAVITY = 9.80665
-"""m/s^2."""
+"""Standard gravity, m/s^2."""
 
 
 def accel_scale(accel: NDArray[np.float64], config: DataConfig) -> tuple[float, str]:
-    """Return the factor that turns the samples into m/s^2, and a note ("" where there is nothing to say).
+    """Return the factor that converts the samples to m/s^2, and a note ("" where nothing was converted).
 
-    Over a recording the median specific force is near one gravity whatever the vehicle does, so it is near 1
-    for an accelerometer in g and near 9.8 for one in m/s^2.
+    Over a recording the median specific force is near one gravity for any motion of a vehicle, so it is near
+    1 for an accelerometer in g and near 9.8 for one in m/s^2.
 
     Args:
-        accel: (m, 3) as recorded.
-        config: ``accel_unit`` overrides.
+        accel: (m, 3) specific force as recorded.
+        config: its ``accel_unit`` overrides the recognition.
     """
     if config.accel_unit != "auto":
         return (STANDARD_GRAVITY if config.accel_unit == "g" else 1.0), ""
@@ -40,7 +84,7 @@ def accel_scale(accel: NDArray[np.float64], config: DataConfig) -> tuple[float, 
 
 _WINDOW_S = 0.5
 _FASTEST = 8.0
-"""No vehicle and no hand turns on average faster than this for half a second, rad/s."""
+"""Largest plausible mean angular rate of a vehicle or a hand over half a second, rad/s."""
 _CLEAR_TURN = 0.2
 _SEEN_SHARE = 0.15
 _STILL_GYRO = 0.05
@@ -52,7 +96,7 @@ _LOWEST_ACCEL_LIMIT = 12.0
 
 
 def saturation(imu: ImuData, seconds: NDArray[np.float64]) -> list[str]:
-    """Return a sentence for each axis whose extreme value is held again and again."""
+    """Return a sentence for each axis whose extreme value is held repeatedly."""
     sentences = []
     for values, name, unit, lowest in (
         (imu.gyro, "gyroscope", "rad/s", _LOWEST_GYRO_LIMIT),
@@ -75,7 +119,7 @@ def saturation(imu: ImuData, seconds: NDArray[np.float64]) -> list[str]:
 
 
 def degrees_suspected(imu: ImuData, seconds: NDArray[np.float64]) -> str:
-    """Return a sentence if the angular rates are too high for rad/s, by themselves or beside gravity."""
+    """Return a sentence if the angular rates are too high for rad/s, as such or compared with gravity."""
     sums = _windowed(np.concatenate([imu.gyro, imu.accel], axis=1), seconds, _WINDOW_S)
     if len(sums) < 4:
         return ""
@@ -89,7 +133,7 @@ def degrees_suspected(imu: ImuData, seconds: NDArray[np.float64]) -> str:
             f"the angular rate averages {rate.max():.1f} rad/s over half a second at {at:.1f} s, more than "
             f"vehicles and hands turn; {advice}"
         )
-    # gravity stays put: a body that rolls or pitches sees it turn by as much
+    # gravity is fixed in the world: in the frame of a body that rolls or pitches it turns by the same angle
     strength = np.linalg.norm(sums[:, 3:], axis=1, keepdims=True)
     down = sums[:, 3:] / np.where(strength > 0, strength, 1.0)
     turn = (sums[1:, :3] + sums[:-1, :3]) / 2 * _WINDOW_S
@@ -105,7 +149,7 @@ def degrees_suspected(imu: ImuData, seconds: NDArray[np.float64]) -> str:
 
 
 def gravity_sign(imu: ImuData, seconds: NDArray[np.float64], T_imu_lidar: NDArray[np.float64] | None) -> str:
-    """Return a sentence if the specific force points down, at rest or, where there is none, on average."""
+    """Return a sentence if the specific force points down, at rest or, without a rest, on average."""
     still = still_second(imu, seconds)
     when = "on average" if still is None else f"at rest ({seconds[still.start]:.1f} s)"
     force = imu.accel[still or slice(None)].mean(axis=0)
@@ -122,7 +166,7 @@ def gravity_sign(imu: ImuData, seconds: NDArray[np.float64], T_imu_lidar: NDArra
 
 
 def still_second(imu: ImuData, seconds: NDArray[np.float64], length_s: float = 1.0) -> slice | None:
-    """Return the first ``length_s`` of samples whose rates and forces hardly change, or None."""
+    """Return the first ``length_s`` seconds of samples in which rates and forces hardly change, or None."""
     start = 0
     while start < len(seconds) and seconds[start] + length_s <= seconds[-1] + 1e-6:
         end = int(np.searchsorted(seconds, seconds[start] + length_s))
@@ -139,7 +183,7 @@ def still_second(imu: ImuData, seconds: NDArray[np.float64], length_s: float = 1
 
 
 def first_motion(imu: ImuData, seconds: NDArray[np.float64]) -> float | None:
-    """Return when, s, the mean rate or force of a second first leaves the recording's median, or None."""
+    """Return when (s) a second's mean rate or force first leaves the recording's median, or None."""
     means = _windowed(np.concatenate([imu.gyro, imu.accel], axis=1), seconds, 1.0)
     off = np.abs(means - np.median(means, axis=0))
     moves = (off[:, :3].max(axis=1) > _STILL_GYRO) | (off[:, 3:].max(axis=1) > _STILL_ACCEL)
@@ -147,7 +191,7 @@ def first_motion(imu: ImuData, seconds: NDArray[np.float64]) -> float | None:
 
 
 def _held(column: NDArray[np.float64], limit: float, lowest: float) -> NDArray[np.intp]:
-    """Return where the extreme value is held, if values pile up there as they do at the end of a range."""
+    """Return where the extreme value is held, if values accumulate there as at the end of a range."""
     if abs(limit) < lowest:
         return np.zeros(0, np.intp)
     at = np.flatnonzero(column == limit)
@@ -171,48 +215,6 @@ def _windowed(
     return np.add.reduceat(values, starts, axis=0) / counts[:, None]
 
 
-GAP_FACTOR = 5.0
-"""An interval longer than this many median ones is a gap."""
-LARGEST = 1e5
-"""A reading beyond this is a fault of the recording in any unit: 10,000 g in m/s^2."""
-_NAMED_AT_MOST = 3
-_LATE_S = 0.1
-
-
-def cleaned(
-    imu: ImuData, source: str, T_imu_lidar: NDArray[np.float64] | None = None
-) -> tuple[ImuData, tuple[str, ...]]:
-    """Drop samples that cannot be used, convert units, and say what was done and what looks wrong.
-
-    Dropped are samples that are not finite or impossibly large, repeat a stamp, or step back in time: of the
-    order they were recorded in, the longest part whose time ascends is kept, of several the one recorded
-    first. An accelerometer in g is converted. Gaps, saturation, a gyroscope in deg/s and a specific force
-    that points down at rest are only reported. Times are named in s from the recording's first sample.
-
-    Args:
-        imu: in recorded order.
-        source: what the sentences begin with: file or topic.
-        T_imu_lidar: (4, 4); says which way is up, without it the IMU's z axis is.
-    """
-    origin = int(imu.stamp_ns[0]) if len(imu.stamp_ns) else 0
-    said: list[str] = []
-    imu = _only(imu, _finite(imu, said))
-    imu = _only(imu, _ascending(imu.stamp_ns, origin, said))
-    if len(imu.stamp_ns) == 0:
-        return imu, tuple(f"{source}: {sentence}" for sentence in [*said, "no IMU sample is left."])
-    scale, note = accel_scale(imu.accel, DataConfig())
-    imu = replace(imu, accel=imu.accel * scale)
-    seconds = np.asarray((imu.stamp_ns - origin) * 1e-9, np.float64)
-    said += [
-        f"{note}." if note else "",
-        gaps(imu.stamp_ns, origin),
-        *saturation(imu, seconds),
-        degrees_suspected(imu, seconds),
-        gravity_sign(imu, seconds, T_imu_lidar),
-    ]
-    return imu, tuple(f"{source}: {sentence}" for sentence in said if sentence)
-
-
 def gaps(stamp_ns: NDArray[np.int64], origin_ns: int) -> str:
     """Return a sentence that names the intervals longer than ``GAP_FACTOR`` median ones, "" without any."""
     if len(stamp_ns) < 3:
@@ -234,12 +236,12 @@ def gaps(stamp_ns: NDArray[np.int64], origin_ns: int) -> str:
 
 
 def coverage(imu: ImuData, start_ns: int, end_ns: int, time_offset: float = 0.0) -> list[str]:
-    """Return a sentence for each end at which the samples leave scans uncovered.
+    """Return a sentence for each end of the recording at which scans have no inertial samples.
 
     Args:
-        imu: stamps ascending.
-        start_ns: first scan's start, ns.
-        end_ns: last scan's end, ns.
+        imu: samples with ascending stamps.
+        start_ns: start of the first scan, ns.
+        end_ns: end of the last scan, ns.
         time_offset: a scan stamped t was taken at IMU time t + time_offset, s.
     """
     if len(imu.stamp_ns) == 0:
@@ -291,7 +293,7 @@ def _ascending(stamp_ns: NDArray[np.int64], origin_ns: int, said: list[str]) -> 
     kept = np.ones(len(stamp_ns), bool)
     if np.all(steps > 0):
         return kept
-    # later than all before and earlier than all after: in every longest ascent
+    # a sample later than all before and earlier than all after is in every longest ascending subsequence
     kept[1:] &= stamp_ns[1:] > np.maximum.accumulate(stamp_ns)[:-1]
     kept[:-1] &= stamp_ns[:-1] < np.minimum.accumulate(stamp_ns[::-1])[::-1][1:]
     disputed = np.flatnonzero(~kept)
@@ -316,10 +318,10 @@ def _ascending(stamp_ns: NDArray[np.int64], origin_ns: int, said: list[str]) -> 
 
 
 def _longest_ascent(stamps: NDArray[np.int64]) -> list[int]:
-    """Return the indices of the longest strictly ascending subsequence; of several the one that is earliest.
+    """Return the indices of the longest strictly ascending subsequence; of several the earliest one.
 
-    Patience sorting (Fredman, "On computing the length of longest increasing subsequences", 1975), from the
-    back: a later sample gives way to an earlier one that does as well.
+    Patience sorting (Fredman, "On computing the length of longest increasing subsequences", 1975), started
+    at the end: a later sample is replaced by an earlier one that serves as well.
     """
     tails: list[int] = []
     tail_index: list[int] = []

@@ -71,7 +71,7 @@ class KittiSequence:
         return self._log.sentences
 
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
-        """Yield scans; compensated: duration 0; else they start half a sweep before the camera's stamp."""
+        """Yield scans: duration 0 if compensated, else a start half a sweep before the camera's stamp."""
         stop = None if count is None else start + count
         for number, path in self._files[start:stop]:
             rows = read_returns(path, self._log.add)
@@ -87,11 +87,11 @@ class KittiSequence:
         return None
 
     def truth(self) -> Trajectory | None:
-        """Return T_world_lidar = (P_0 Tr)^-1 P_i Tr, the first identity; None without poses or calib.txt."""
+        """Return T_world_lidar = (P_0 Tr)^-1 P_i Tr, first pose identity; None without poses or calib.txt."""
         if self._poses_path is None or self._T_cam_lidar is None:
             return None
         poses = read_kitti_poses(self._poses_path)
-        # a pose whose time is wrong is none
+        # a pose with a wrong time is not used
         kept = ascending(self._stamps[: len(poses)])
         lidar = poses[kept] @ self._T_cam_lidar
         return Trajectory(np.array(self._stamps, np.int64)[kept], np.linalg.inv(lidar[0]) @ lidar)
@@ -182,12 +182,12 @@ class KittiSequence:
 def raise_elevation(points: NDArray[np.float32], angle_deg: float) -> NDArray[np.float32]:
     """Raise each point's elevation angle by ``angle_deg``: rotate it about cross(p, z).
 
-    KITTI's intrinsic calibration is off by about 0.205 deg (IMLS-SLAM, Deschaud 2018). A point straight above
-    or below has no such axis and stays.
+    KITTI's intrinsic calibration is wrong by about 0.205 deg (IMLS-SLAM, Deschaud 2018). A point exactly
+    above or below has no such axis and is not moved.
 
     Args:
         points: (n, 3) m, lidar frame.
-        angle_deg: deg; 0 returns the points as they are.
+        angle_deg: angle to add, deg; 0 returns the points as they are.
     """
     if angle_deg == 0.0 or len(points) == 0:
         return points
@@ -203,6 +203,6 @@ def raise_elevation(points: NDArray[np.float32], angle_deg: float) -> NDArray[np
 
 
 def pose_files(path: Path) -> list[Path]:
-    """Return where the true poses of a sequence folder may lie, the first that exists counts."""
+    """Return the places where a sequence's true poses may be stored; the first that exists is read."""
     path = path.resolve()
     return [path / "poses.txt", path.parent.parent / "poses" / f"{path.name}.txt"]

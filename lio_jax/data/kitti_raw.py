@@ -1,4 +1,4 @@
-"""OXTS packets of KITTI raw drives: one INS read as IMU, as GPS and as ground truth."""
+"""KITTI raw drives: Velodyne scans, and OXTS packets of one INS that serve as IMU, GPS and ground truth."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -39,14 +39,14 @@ class OxtsPackets:
 
     stamp_ns: NDArray[np.int64]
     values: NDArray[np.float64]
-    """(n, 30) as the devkit's dataformat.txt lists them."""
+    """Values of each packet, (n, 30), in the order of the devkit's dataformat.txt."""
 
     def imu(self) -> ImuData:
         """Return ax ay az and wx wy wz, body frame; the INS attitude is left out because it is the truth."""
         return ImuData(self.stamp_ns, gyro=self.values[:, _GYRO], accel=self.values[:, _ACCEL])
 
     def gps(self) -> GpsData:
-        """Return fixes in ENU around the first, isotropic covariance pos_accuracy squared."""
+        """Return fixes in ENU around the first fix; the covariance is isotropic, pos_accuracy squared."""
         geodetic = self.values[:, _GEODETIC]
         origin = (float(geodetic[0, 0]), float(geodetic[0, 1]), float(geodetic[0, 2]))
         variance = self.values[:, _POSITION_SIGMA] ** 2
@@ -57,8 +57,8 @@ class OxtsPackets:
     def truth(self) -> Trajectory:
         """Return T_world_imu: Mercator position minus the first one, R = Rz(yaw) Ry(pitch) Rx(roll).
 
-        Only the position is taken relative to the first pose: the world stays level with x to the east, y to
-        the north and z up.
+        Only the position is relative to the first pose: the world stays level, with x to the east, y to the
+        north and z up.
         """
         positions = mercator_positions(self.values[:, _GEODETIC])
         poses = np.tile(np.eye(4), (len(positions), 1, 1))
@@ -69,7 +69,7 @@ class OxtsPackets:
 
 
 def read_timestamps(path: Path) -> NDArray[np.int64]:
-    """Read lines ``YYYY-MM-DD HH:MM:SS.nnnnnnnnn`` (UTC) to the ns; (n,).
+    """Read lines ``YYYY-MM-DD HH:MM:SS.nnnnnnnnn`` (UTC) with full precision, (n,) ns.
 
     Raises:
         LioJaxError: the file is missing or a line is not a date and time.
@@ -89,10 +89,10 @@ def read_timestamps(path: Path) -> NDArray[np.int64]:
 
 
 def read_oxts(folder: Path, warn: Callable[[str], None]) -> OxtsPackets | None:
-    """Read ``folder``/data/*.txt with ``folder``/timestamps.txt; None where there are no packets.
+    """Read ``folder``/data/*.txt with ``folder``/timestamps.txt; return None where there are no packets.
 
-    Packets that do not hold 30 finite numbers, that have no timestamp, or whose stamp does not ascend are
-    left out with a warning.
+    A packet is left out with a warning if it does not hold 30 finite numbers, if it has no timestamp, or if
+    its stamp does not ascend.
     """
     if not (folder / "data").is_dir():
         return None
@@ -196,7 +196,7 @@ class KittiRawSequence:
         return self._log.sentences
 
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
-        """Yield scans, stamped at their start; all points at time 0 if config says they are compensated."""
+        """Yield scans, stamped at their start; all points have time 0 if config declares them compensated."""
         stop = None if count is None else start + count
         for sweep in self._sweeps[start:stop]:
             rows = read_returns(sweep.path, self._log.add)
@@ -213,15 +213,15 @@ class KittiRawSequence:
             )
 
     def imu(self) -> ImuData | None:
-        """Return the INS's accelerations and rates, body frame (10 Hz in sync drives, 100 Hz in extract)."""
+        """Return accelerations and rates of the INS, body frame (10 Hz in sync drives, 100 Hz in extract)."""
         return None if self._oxts is None else self._oxts.imu()
 
     def gps(self) -> GpsData | None:
-        """Return the INS's positions in ENU around the first."""
+        """Return positions of the INS in ENU around the first."""
         return None if self._oxts is None else self._oxts.gps()
 
     def truth(self) -> Trajectory | None:
-        """Return the INS's T_world_imu: level, first position at the origin, devkit's Mercator convention."""
+        """Return T_world_imu of the INS: level, starts at the origin, devkit's Mercator projection."""
         return None if self._oxts is None else self._oxts.truth()
 
     @cached_property
@@ -258,7 +258,7 @@ class KittiRawSequence:
         return sweeps
 
     def _read_times(self, velodyne: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the stamps of the sweeps' starts, ns, and their durations, s."""
+        """Return the stamps at which the sweeps start, ns, and the durations of the sweeps, s."""
         period_ns = round(self._config.scan_period * 1e9)
         if (velodyne / "timestamps_start.txt").is_file():
             starts = read_timestamps(velodyne / "timestamps_start.txt")

@@ -13,12 +13,12 @@ from lio_jax.data.trajectory import Trajectory, write_kitti_poses
 from lio_jax.data.whole_output import written_whole
 
 MARKER = "times.txt"
-"""A folder that may be overwritten holds it."""
+"""A folder that holds this file may be overwritten."""
 
 _BEYOND_NS = 1_000_000
-"""1 ms, in which nothing moves far."""
+"""Largest extrapolation of the truth beyond its ends, ns: in 1 ms no body moves far."""
 _T_CAM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-"""KITTI's poses are those of a camera: here one in the lidar's place, z ahead and y down."""
+"""Pose of the lidar in the camera frame (KITTI's poses are camera poses): same place, z ahead and y down."""
 
 
 def write_kitti(
@@ -29,22 +29,22 @@ def write_kitti(
     scans: Iterable[LidarScan] | None = None,
     overwrite: bool = False,
 ) -> int:
-    """Write a sequence folder and return its number of scans; scans are streamed, never held together.
+    """Write a sequence folder and return its number of scans (scans are streamed).
 
-    A scan's stamp is that of its middle, counted from the first one's; points lie ring after ring by
-    rising azimuth from straight ahead, as KITTI has them, because it stores no ring. Poses are written if
-    the truth covers every scan.
+    A scan's stamp is the time of its middle, counted from the first scan's middle. Points are stored as in
+    KITTI, which has no ring field: ring after ring, by rising azimuth from straight ahead. Poses are written
+    if the truth covers every scan.
 
     Args:
-        path: of the folder; it appears only when everything is written.
-        sequence: what to write.
-        vertical_correction_deg: by how much readers raise the elevation angles: the points are lowered by it.
-        scans: in place of the sequence's own, such as the same under a progress bar.
-        overwrite: replace a sequence folder that is there.
+        path: path of the folder; it appears only when all its files are written.
+        sequence: the recording to write.
+        vertical_correction_deg: angle by which readers raise the points; they are lowered by it here.
+        scans: scans to write in place of the sequence's own, for example the same scans with a progress bar.
+        overwrite: whether an existing sequence folder is replaced.
 
     Raises:
         UsageError: ``path`` exists and may not be replaced.
-        LioJaxError: there are no scans, or the disk takes no more.
+        LioJaxError: there are no scans, or the disk is full or cannot be written.
     """
     path = Path(path)
     with written_whole(path, overwrite, MARKER) as aside:
@@ -76,14 +76,15 @@ def _rows(scan: LidarScan, vertical_correction_deg: float) -> NDArray[np.float32
 
 
 def _camera_poses(sequence: Sequence, stamps: NDArray[np.int64]) -> NDArray[np.float64] | None:
-    """Return the camera's poses in the first one's frame; None unless all are known."""
+    """Return the camera's poses in the frame of its first pose; None unless all are known."""
     truth: Trajectory | None = sequence.truth()
     if truth is None or not len(truth):
         return None
     T_imu_lidar = np.eye(4) if sequence.info.T_imu_lidar is None else sequence.info.T_imu_lidar
     known = truth.at(np.clip(stamps, truth.stamp_ns[0], truth.stamp_ns[-1]))
     beyond = np.maximum(truth.stamp_ns[0] - stamps, stamps - truth.stamp_ns[-1])
-    # the middle of the first and of the last scan may lie just outside of a truth at the scans' ends
+    # the middle of the first and of the last scan may be just outside a truth that covers the scans' ends
+    # only
     if beyond.max() > _BEYOND_NS:
         return None
     lidar = known.poses @ T_imu_lidar

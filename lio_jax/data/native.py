@@ -19,7 +19,7 @@ from lio_jax.data.trajectory import Trajectory, read_tum
 from lio_jax.data.velodyne_file import listed, missing_numbers, numbered_files
 
 FORMAT_VERSION = 1
-"""Version written to and accepted from meta.yaml."""
+"""Format version that is written to meta.yaml, and the only one that is read."""
 
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 
@@ -67,21 +67,21 @@ class NativeSequence:
         return self._log.sentences
 
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
-        """Yield scans by their numbers; unreadable and out-of-order ones are left out and reported."""
+        """Yield scans by their numbers; unreadable and out-of-order scans are left out and reported."""
         stop = None if count is None else start + count
         read = ((path, self._load_scan(path)) for path in self._files[start:stop])
         stamped = (Stamped(scan.stamp_ns, str(path), scan) for path, scan in read if scan is not None)
         yield from in_time_order(stamped, self._log.add)
 
     def imu(self) -> ImuData | None:
-        """Return imu.npz, or None where there is none."""
+        """Return the samples of imu.npz, or None where there is no such file."""
         arrays = self._arrays("imu.npz", ("stamp_ns", "gyro", "accel"))
         if arrays is None:
             return None
         return ImuData(arrays["stamp_ns"], arrays["gyro"], arrays["accel"], arrays.get("orientation"))
 
     def gps(self) -> GpsData | None:
-        """Return gps.npz, or None where there is none."""
+        """Return the fixes of gps.npz, or None where there is no such file."""
         arrays = self._arrays("gps.npz", ("stamp_ns", "position", "covariance", "origin"))
         if arrays is None:
             return None
@@ -91,11 +91,11 @@ class NativeSequence:
         )
 
     def truth(self) -> Trajectory | None:
-        """Return truth.tum (T_world_imu), or None where there is none."""
+        """Return T_world_imu from truth.tum, or None where there is no such file."""
         return self._truth
 
     def truth_arrays(self) -> dict[str, NDArray[Any]]:
-        """Return what truth.npz holds (true noise, biases); empty where there is none."""
+        """Return the arrays of truth.npz (true noise, biases); empty where there is no such file."""
         return self._arrays("truth.npz", ()) or {}
 
     @cached_property

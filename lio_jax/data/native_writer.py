@@ -1,4 +1,4 @@
-"""Write recordings in the package's own format, whole or not at all."""
+"""Write recordings in the package's own format, complete or not at all."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -28,23 +28,23 @@ def write_native(
     truth_arrays: Mapping[str, ArrayLike] | None = None,
     overwrite: bool = False,
 ) -> int:
-    """Write a native folder and return its number of scans; scans are streamed, never held together.
+    """Write a native folder and return its number of scans (scans are streamed).
 
     Args:
-        path: of the folder; it appears only when everything is written.
-        scans: in time order.
-        name: short name; empty: the folder's name is used when it is read.
-        sensor: sensor model.
-        T_imu_lidar: (4, 4), or None where unknown.
+        path: path of the folder; it appears only when all its files are written.
+        scans: scans in time order.
+        name: short name of the recording; empty: readers use the folder's name.
+        sensor: name of the sensor model.
+        T_imu_lidar: (4, 4) pose of the lidar in the IMU frame, or None where unknown.
         imu: inertial samples.
-        gps: fixes.
-        truth: T_world_imu.
-        truth_arrays: anything else that is known to be true (noise, biases), kept in truth.npz.
-        overwrite: replace an existing native folder.
+        gps: GPS fixes.
+        truth: true poses, T_world_imu.
+        truth_arrays: other true quantities (noise, biases), stored in truth.npz.
+        overwrite: whether an existing native folder is replaced.
 
     Raises:
         UsageError: ``path`` exists and may not be replaced.
-        LioJaxError: there are no scans, or the disk takes no more.
+        LioJaxError: there are no scans, or the disk is full or cannot be written.
     """
     path = Path(path)
     with written_whole(path, overwrite, "meta.yaml") as aside:

@@ -18,7 +18,7 @@ _ORIENTATION, _GYRO, _ACCEL = slice(0, 32), slice(104, 128), slice(200, 224)
 
 
 class ImuCollector:
-    """Gathers serialised Imu messages compactly (an hour at 400 Hz in 130 MB), for arrays at the end."""
+    """Collect serialised Imu messages compactly (an hour at 400 Hz in 130 MB) and turn them into arrays."""
 
     def __init__(self, ros2: bool) -> None:
         self._ros2 = ros2
@@ -28,7 +28,7 @@ class ImuCollector:
         self._orientation_covariance = b""
 
     def add(self, raw: bytes) -> None:
-        """Take one message.
+        """Add one message.
 
         Raises:
             ValueError: the message is shorter than an Imu message.
@@ -45,10 +45,10 @@ class ImuCollector:
         self._values += body[_ORIENTATION] + body[_GYRO] + body[_ACCEL]
 
     def imu(self) -> tuple[ImuData | None, tuple[str, ...]]:
-        """Return the samples in time order, accelerometer as recorded, and one sentence for each repair.
+        """Return the samples in time order, with accelerations as recorded, and one sentence for each repair.
 
-        Orientation is kept only where the messages state one: a covariance that does not begin with -1, and
-        rotations that are neither all zero nor all identity.
+        Orientation is kept only where the messages state it: their covariance does not begin with -1, and
+        their rotations are neither all zero nor all identity.
         """
         repairs = []
         stamps = np.array(self._stamps, np.int64)
@@ -86,11 +86,11 @@ FIX_TYPE = "sensor_msgs/msg/NavSatFix"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 
 _FARTHEST_M = 200e3
-"""Fixes farther than this from the middle one are no part of a drive: a receiver's place before it knew."""
+"""Fixes farther than this from the median fix are no part of a drive, m: receivers may report them first."""
 
 
 class GpsCollector:
-    """Gathers deserialised fixes and turns them into arrays once."""
+    """Collect deserialised fixes and turn them into arrays."""
 
     def __init__(self) -> None:
         self._stamps: list[int] = []
@@ -100,7 +100,7 @@ class GpsCollector:
         self._skipped = 0
 
     def add(self, message: Any) -> None:
-        """Take one NavSatFix or Odometry; fixes without a position (no fix, NaN, 0/0) are skipped."""
+        """Add one NavSatFix or Odometry; a message without a position (no fix, NaN, 0/0) is skipped."""
         if hasattr(message, "latitude"):
             position = (message.latitude, message.longitude, message.altitude)
             valid = message.status.status >= 0 and position[:2] != (0.0, 0.0)
@@ -121,7 +121,7 @@ class GpsCollector:
         self._covariances.append(np.array(covariance, np.float64))
 
     def gps(self) -> tuple[GpsData | None, tuple[str, ...]]:
-        """Return the positions in time order and one sentence for each thing that was assumed or left out."""
+        """Return the fixes in time order, and one sentence for each assumption and each omission."""
         notes = []
         if self._skipped:
             notes.append(f"GPS: {self._skipped} messages without a valid fix were left out")
@@ -150,6 +150,6 @@ class GpsCollector:
 
 
 def _in_one_region(geodetic: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return (n,) whether fixes are near the middle one, whose tangent plane is level for them."""
+    """Return whether each fix is near the median fix, so that its tangent plane is level for it, (n,)."""
     places = geodetic_to_ecef(geodetic)
     return np.asarray(np.linalg.norm(places - np.median(places, axis=0), axis=1) < _FARTHEST_M)

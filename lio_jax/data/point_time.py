@@ -1,16 +1,17 @@
-"""When each point was measured: unit, reference and anchor of its time, recognised from the first scans.
+"""When each point was measured: unit, reference and anchor of point times, recognised from the first scans.
 
-Every recording answers three questions in its own way; all are settled by magnitudes, and each answer can be
+Recordings answer three questions in different ways. Each answer is recognised by magnitudes and can be
 overridden in :class:`~lio_jax.core.config.DataConfig`:
 
-- Absolute or relative? Absolute times advance from scan to scan as the header stamps do; relative ones start
-  anew.
-- Which unit? The one in which that advance equals the header's, or else in which a scan's spread comes
-  nearest to the time between scans (units are a factor of 1000 apart, so there is no close call).
-- What does the header stamp mark? Absolute times on the header's clock place the scan by themselves. Relative
-  times down to below zero count from the header stamp. Relative times from zero fit a stamp at either end: a
-  message cannot be received before its scan ended, so a receipt sooner after the stamp than the scan lasts
-  says "end"; without such evidence "start" is assumed, as most drivers do it, and the note says so.
+- Absolute or relative? Absolute times advance from scan to scan as the header stamps do; relative times start
+  again in each scan.
+- Which unit? The unit in which that advance equals the header's; for relative times the unit in which a
+  scan's spread is nearest to the time between scans. Units differ by a factor of 1000, so the choice is
+  clear.
+- What does the header stamp mark? Absolute times on the header's clock place the scan without the stamp.
+  Relative times below zero count from the header stamp. Relative times from zero fit a stamp at either end. A
+  message cannot be received before its scan ended: if it is received sooner after the stamp than the scan
+  lasts, the stamp marks the end. Otherwise "start" is assumed, as most drivers do it, and the note states it.
 """
 
 import math
@@ -27,22 +28,23 @@ from lio_jax.data.config import DataConfig
 TICK_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 
 _CLEARLY_RECEIVED_LATER = 0.002
-"""s; bags written by a converter have receipt equal to the stamp, which tells nothing."""
+"""Latency above which a receipt is evidence, s: in converted bags the receipt equals the stamp."""
 _LONGEST_LATENCY = 5.0
-"""s; beyond this the recorder's clock is another one than the sensor's."""
+"""Latency above which the recorder's clock differs from the sensor's, s."""
 
 
 @dataclass(frozen=True)
 class TimeSample:
-    """What one scan tells about its times."""
+    """Stamps and time range of one scan."""
 
     header_ns: int
+    """Header stamp, ns."""
     received_ns: int
     """When the recorder got the message, ns."""
     low: float | int
-    """Least per-point time, ticks."""
+    """Smallest per-point time, ticks."""
     high: float | int
-    """Greatest per-point time, ticks."""
+    """Largest per-point time, ticks."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class PointTiming:
     absolute: bool
     """Whether ticks count from an epoch instead of from the scan."""
     anchor: Literal["points", "start", "end", "inside"]
-    """What fixes the scan in time: its own absolute times, or the header stamp at that place of the scan."""
+    """What places the scan in time: its own absolute times, or the header stamp at that place in the scan."""
     sweep: float
     """Usual duration of a scan, s."""
     note: str
@@ -77,18 +79,18 @@ class PointTiming:
         """Return the scan's start in ns, the points' times in s from there, and the scan's duration in s.
 
         Args:
-            header_ns: stamp of the message.
+            header_ns: header stamp of the message, ns.
             time: (n,) ticks.
-            low, high: least and greatest tick of the scan.
+            low, high: smallest and largest tick of the scan.
         """
         tick = self.tick_ns * 1e-9
-        # Relative times from zero keep their zero: the first firings may not have returned.
+        # Relative times from zero keep their zero: the first firings may have no return.
         zero = low if self.absolute else min(low, 0)
         last = high
         if self.anchor == "end" and zero < 0 and not self.absolute:
             last = max(high, 0)
         duration = float((last - zero) * tick)
-        # Subtract in the ticks' own type: only the difference fits a float32.
+        # Subtract in the ticks' own type: only the difference fits into a float32.
         since = (time - time.dtype.type(zero)) * tick
         start_ns = header_ns
         if self.anchor == "points":
@@ -109,13 +111,13 @@ def scan_period(header_ns: Sequence[int], fallback: float) -> float:
 def recognise_point_time(
     samples: Sequence[TimeSample], field: str, kind: str, config: DataConfig
 ) -> PointTiming | None:
-    """Settle the meaning of per-point times from the first scans; None where they are all the same.
+    """Settle the meaning of per-point times from the first scans; None where all times are equal.
 
     Args:
-        samples: of several consecutive scans, at least one.
+        samples: time samples of several consecutive scans, at least one.
         field: name of the time field, for the note.
         kind: its data type, for the note.
-        config: overrides, and the scan period where there is only one scan.
+        config: overrides, and the scan period to use where there is only one scan.
     """
     period = scan_period([sample.header_ns for sample in samples], config.scan_period)
     spread = float(np.median([sample.high - sample.low for sample in samples]))
@@ -142,7 +144,7 @@ def recognise_point_time(
 def stamp_end(
     samples: Sequence[TimeSample], sweep: float, config: DataConfig
 ) -> tuple[Literal["start", "end"], str]:
-    """Tell which end of the scan header stamps mark, where points do not say it, and how that is known."""
+    """Return which end of a scan header stamps mark, where points do not state it, and the evidence."""
     if config.stamp_at != "auto":
         return config.stamp_at, f"header stamp at scan {config.stamp_at} (config.data.stamp_at)"
     latency = np.array([sample.received_ns - sample.header_ns for sample in samples]) * 1e-9
@@ -183,7 +185,7 @@ def _anchor(
     if config.stamp_at != "auto":
         return stamp_end(samples, sweep, config)
     if absolute:
-        # Where in the scan the header lies on the points' own clock: 0 its start, 1 its end.
+        # Place of the header in the scan on the points' own clock: 0 is its start, 1 its end.
         offsets = [(s.header_ns - _ticks_to_ns(s.low, tick_ns)) * 1e-9 for s in samples]
         place = float(np.median(offsets)) / sweep
         if -1.0 < place < 2.0:

@@ -13,7 +13,7 @@ from lio_jax.data.bag_files import cdr_aligned, read_header
 
 
 def valid_returns(points: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Tell for each point (n, 3 or more; x, y, z first) whether x, y, z are finite and not all zero, (n,)."""
+    """Return whether x, y, z of each point (n, 3 or more columns) are finite and not all zero, (n,)."""
     with np.errstate(over="ignore", invalid="ignore"):
         squared = points[:, 0] ** 2 + points[:, 1] ** 2 + points[:, 2] ** 2
     return np.isfinite(squared) & (squared > 0)
@@ -21,26 +21,26 @@ def valid_returns(points: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class RawCloud:
-    """The real returns of one message, times still in the sensor's own ticks."""
+    """The real returns of one message, with times in the sensor's own ticks."""
 
     stamp_ns: int
     """Header stamp, ns."""
     points: NDArray[np.float32]
-    """(n, 3) m, finite and not all zero."""
+    """Points, (n, 3) m, lidar frame, finite and not all zero."""
     intensity: NDArray[np.float32]
-    """(n,) 0 where the message holds none."""
+    """Intensity, (n,), in the sensor's scale; 0 where the message holds none."""
     ring: NDArray[np.int32] | None
-    """(n,) beam index."""
+    """Beam index, (n,); None where the message holds none."""
     ring_source: str
-    """Name of the ring field; "rows" where an organised cloud's rows stand for it; "" where there is none."""
+    """Name of the ring field; "rows" where the rows of an organised cloud replace it; "" without rings."""
     time: NDArray[Any] | None
-    """(n,) ticks."""
+    """Time of each point, (n,) ticks; None where the message holds none."""
     time_field: str
     """Name of the time field, "" where there is none."""
     time_range: tuple[float, float] | tuple[int, int] | None
-    """Least and greatest tick of the message, firings without a return included."""
+    """Smallest and largest tick of the message, with firings without a return included."""
     dropped: int = 0
-    """Number of recorded points that are no returns."""
+    """Number of recorded points that are not returns."""
 
 
 def assemble(
@@ -53,10 +53,10 @@ def assemble(
     time_field: str,
     keep: NDArray[np.bool_] | None = None,
 ) -> RawCloud:
-    """Drop what is no return (NaN, infinite, all zero, ``keep`` false, no finite time) and pack the rest.
+    """Drop points without a return (NaN, infinite, all zero, ``keep`` false, no finite time); pack the rest.
 
     Args:
-        xyz: (3, n) m, one row a coordinate.
+        xyz: (3, n) m, one row for each coordinate.
         intensity, ring, time, keep: (n,) or None.
     """
     valid = valid_returns(xyz.T)
@@ -85,7 +85,7 @@ def assemble(
 
 
 def _time_range(time: NDArray[Any], valid: NDArray[np.bool_]) -> tuple[float, float] | tuple[int, int] | None:
-    """Take firings without a return into account, unless their time was zeroed together with their point."""
+    """Return the range of ticks; firings without a return count unless their time was zeroed, too."""
     counted = time[valid | (np.isfinite(time) & (time != 0))]
     if counted.size == 0:
         return None
@@ -102,7 +102,7 @@ _POINT_BYTES = 19
 
 
 def keep_by_tag(tag: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Keep the points whose return-number bits mark a single or a first return, as FAST-LIO2 does.
+    """Return which points' return-number bits mark a single or a first return, as FAST-LIO2 keeps them, (n,).
 
     Source: FAST-LIO2's Livox preprocessing, ``(tag & 0x30) in {0x00, 0x10}``.
     """
@@ -111,21 +111,22 @@ def keep_by_tag(tag: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def custom_msg_field_names() -> tuple[str, ...]:
-    """Return name and type of a CustomMsg's point, such as "x f4"."""
+    """Return name and type of each field of a CustomMsg's point, for example "x f4"."""
     return tuple(f"{name} {form}" for name, form in zip(_POINT_FIELDS, _POINT_FORMATS, strict=True))
 
 
 def decode_custom_msg(raw: bytes, ros2: bool) -> RawCloud:
     """Decode a serialised CustomMsg of any Livox driver; times are uint32 ns from the header stamp.
 
-    The bytes are read directly: the generic decoder would make one Python object a point.
+    The bytes are read directly, because the generic decoder would make one Python object for each point.
 
     Raises:
-        ValueError: the message is shorter than it says.
+        ValueError: the message is shorter than its header states.
     """
     header = read_header(raw, ros2)
     body = cdr_aligned(header.body, 8) if ros2 else header.body
-    # uint64 timebase, uint32 point_num, uint8 lidar_id, uint8[3] rsvd, then the points behind their number.
+    # uint64 timebase, uint32 point_num, uint8 lidar_id, uint8[3] rsvd, then the number of points and the
+    # points.
     try:
         (count,) = struct.unpack_from(f"{header.order}I", raw, body + 16)
     except struct.error:
@@ -187,13 +188,13 @@ def decode_pointcloud2(message: Any, *, time_field: str = "", where: str = "Poin
     """Decode a deserialised PointCloud2 message.
 
     Args:
-        message: with the attributes of sensor_msgs/PointCloud2, ``data`` as bytes or uint8 array.
-        time_field: name of the per-point time; "" takes the first known name that is there.
-        where: how errors name the topic.
+        message: object with the attributes of sensor_msgs/PointCloud2, ``data`` as bytes or uint8 array.
+        time_field: name of the per-point time; "" takes the first known name among the fields.
+        where: the topic's name in errors.
 
     Raises:
         LioJaxError: x, y, z or the requested time field is not among the fields.
-        ValueError: this one message is damaged (shorter than it says, or a field beyond the point).
+        ValueError: this message is damaged (shorter than its header states, or a field beyond the point).
     """
     stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
     fields = {field.name: field for field in message.fields}
@@ -240,7 +241,7 @@ def decode_pointcloud2(message: Any, *, time_field: str = "", where: str = "Poin
 
 
 def field_names(message: Any) -> tuple[str, ...]:
-    """Return name and type of a PointCloud2's fields, such as "x f4"."""
+    """Return name and type of each field of a PointCloud2, for example "x f4"."""
     return tuple(f"{field.name} {_SCALARS.get(field.datatype, '?')}" for field in message.fields)
 
 
@@ -249,7 +250,7 @@ def _first(candidates: Sequence[str], by_lower: dict[str, str]) -> str:
 
 
 def _grid(message: Any, fields: Sequence[PointField]) -> NDArray[Any]:
-    """View the message's bytes as (height, width) structured points, padding between rows left out."""
+    """View the message's bytes as (height, width) structured points, without the padding between rows."""
     order = ">" if message.is_bigendian else "<"
     step, height, width = message.point_step, message.height, message.width
     formats = []
@@ -267,7 +268,7 @@ def _grid(message: Any, fields: Sequence[PointField]) -> NDArray[Any]:
             "itemsize": step,
         }
     )
-    # Some drivers leave row_step at 0 or at point_step; a row can never be shorter than its points.
+    # Some drivers set row_step to 0 or to point_step; a row is never shorter than its points.
     row_step = max(message.row_step, width * step)
     needed = (height - 1) * row_step + width * step if height and width else 0
     if needed > len(message.data):
@@ -284,7 +285,7 @@ def _native(column: NDArray[Any]) -> NDArray[Any]:
 
 
 def _rows_as_ring(shape: tuple[int, ...]) -> NDArray[np.int32] | None:
-    """Number the beams of an organised cloud, whose shorter side is the beams."""
+    """Return the row numbers of an organised cloud as rings; the shorter side of the cloud is the beams."""
     height, width = shape
     if not 1 < min(height, width) <= _MOST_ROWS or height == width:
         return None

@@ -1,4 +1,4 @@
-"""Run an iterator ahead on a thread, so that decoding overlaps with estimation."""
+"""Run an iterator ahead on a thread, so that decoding and estimation overlap."""
 
 import queue
 import threading
@@ -15,13 +15,13 @@ class _End:
 
 
 def prefetched(iterator: Iterator[T], depth: int) -> Iterator[T]:
-    """Yield the items of ``iterator``, of which up to ``depth`` are produced ahead on a thread.
+    """Yield the items of ``iterator``; up to ``depth`` of them are produced ahead on a thread.
 
-    What the iterator raises is raised here, in its place. When the consumer stops early (the generator is
+    An exception of the iterator is raised here, at its place. If the consumer stops early (the generator is
     closed or collected), the iterator is closed and the thread has ended on return.
 
     Args:
-        iterator: consumed on one thread only.
+        iterator: the iterator, which is consumed on one thread only.
         depth: number of items held ready; 0 or less: no thread.
     """
     if depth <= 0:
@@ -29,7 +29,7 @@ def prefetched(iterator: Iterator[T], depth: int) -> Iterator[T]:
         return
     ready: queue.Queue[T | _End] = queue.Queue(depth)
     stopped = threading.Event()
-    # A consumer that neither finishes nor closes must not keep the interpreter from exiting: hence daemon.
+    # daemon: a consumer that neither finishes nor closes must not keep the interpreter from exiting
     worker = threading.Thread(target=_produce, args=(iterator, ready, stopped), name="prefetch", daemon=True)
     worker.start()
     try:
@@ -53,13 +53,13 @@ def _produce(iterator: Iterator[T], ready: "queue.Queue[T | _End]", stopped: thr
             ready.put(item)
         if stopped.is_set() and hasattr(iterator, "close"):
             iterator.close()
-    except BaseException as raised:  # whatever it is, it belongs to the consumer
+    except BaseException as raised:  # every exception belongs to the consumer
         error = raised
     ready.put(_End(error))
 
 
 def _discard(ready: "queue.Queue[T | _End]") -> None:
-    """Make room, so that a producer waiting in put() sees that it was stopped."""
+    """Make room, so that a producer that waits in put() notices the stop."""
     try:
         while True:
             ready.get_nowait()

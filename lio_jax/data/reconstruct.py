@@ -1,4 +1,4 @@
-"""Rings and point times of scans whose recording holds neither."""
+"""Reconstruct rings and point times of scans whose recording holds neither."""
 
 from typing import Any
 
@@ -9,20 +9,20 @@ from lio_jax.core.errors import UsageError
 
 _BIN_DEG = 0.05
 _FEW = 0.1
-"""Share of a typical level's points below which a bin of the histogram counts as empty."""
+"""A bin of the histogram counts as empty below this share of a typical level's points."""
 _MARGIN_DEG = 1.0
-"""By so much points may lie beyond the outermost beams."""
+"""Angle by which points may exceed the outermost beams, deg."""
 _DOUBTFUL, _WRONG = 0.05, 0.25
-"""Shares of points beyond them."""
+"""Share of points outside the beams above which a layout is doubtful, or wrong."""
 _MANY, _TOO_MANY = 1.25, 1.5
-"""Levels seen per beam: noise may split a few."""
+"""Levels per beam above which a layout is doubtful, or wrong; noise may split a few levels."""
 
 
 def elevation_levels(points: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Return the elevations at which the points crowd, ascending, deg: one for each beam that spins.
+    """Return the elevations at which points accumulate, ascending, deg: one for each spinning beam.
 
-    Levels are the runs of well-filled bins of 0.05 deg of the elevations' histogram, so that beams less than
-    0.1 deg apart count as one.
+    Levels are runs of well-filled bins of 0.05 deg in the histogram of elevations. Beams less than 0.1 deg
+    apart therefore count as one.
 
     Args:
         points: (n, 3) m, lidar frame, not motion compensated.
@@ -32,7 +32,7 @@ def elevation_levels(points: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         return np.zeros(0)
     low = float(elevation.min())
     counts = np.bincount(((elevation - low) / _BIN_DEG).astype(np.intp))
-    # half of all points lie in bins that are at least this full
+    # half of all points are in bins that are at least this full
     ordered = np.sort(counts)[::-1]
     typical = ordered[np.searchsorted(np.cumsum(ordered), 0.5 * counts.sum())]
     full = np.concatenate([[False], counts > _FEW * typical, [False]])
@@ -41,16 +41,16 @@ def elevation_levels(points: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
 
 
 def check_beams(points: NDArray[np.floating[Any]], beams: int, given: bool, where: str) -> tuple[str, ...]:
-    """Return a sentence if the points do not fit the beams that their rings are reconstructed for.
+    """Return a sentence if the points do not fit the beams for which their rings are reconstructed.
 
     Args:
-        points: (n, 3) m, lidar frame, of one scan.
+        points: points of one scan, (n, 3) m, lidar frame.
         beams: 16, 32 or 64.
-        given: by the settings, else guessed.
+        given: whether the settings state the number of beams; else it is guessed.
         where: recording and topic, for the error.
 
     Raises:
-        UsageError: the beams were given, and are not those of the sensor.
+        UsageError: the number of beams is given by the settings and does not fit the sensor.
     """
     if not len(points):
         return ()
@@ -100,22 +100,22 @@ def azimuth_time(
     """Return each point's time in the sweep from its azimuth, (n,) s within [0, duration].
 
     With ``start_azimuth`` the sweep is one full turn from there. Without it the first and the last point are
-    the ends of the sweep, whose length is taken between pi and 3 pi (A-LOAM's scan registration); when the
-    points are stored ring after ring, so that the last one ends a ring and not the sweep, the sweep is one
+    the ends of the sweep, whose length is taken between pi and 3 pi (A-LOAM's scan registration). If the
+    points are stored ring after ring, the last point ends a ring and not the sweep; the sweep is then one
     full turn from the first point.
 
-    KITTI's HDL-64E scans want ``start_azimuth=KITTI_START_AZIMUTH`` and clockwise: there every ring is stored
-    by rising azimuth from straight ahead, which is not the firing order. Measured on raw drive 0005 in its
-    turn: of ten hypotheses (start behind, ahead, left, right or 150 deg; either direction) and "already
-    compensated", the clockwise sweep from behind leaves the smallest point-to-plane residual between scans
-    1.2 to 2 s apart (median of the inliers, averaged over six pairs: 18.6 mm; uncompensated 20.7, clockwise
-    from 165 and 195 deg 18.8 and 19.4, counter-clockwise from behind 25.1, from ahead 21.3). It is also what
-    KISS-ICP assumes.
+    KITTI's HDL-64E scans need ``start_azimuth=KITTI_START_AZIMUTH`` and clockwise: they store every ring by
+    rising azimuth from straight ahead, which is not the firing order. This was measured on raw drive 0005
+    during its turn. Ten hypotheses were compared (start behind, ahead, left, right or at 150 deg; either
+    direction), and "already compensated". The clockwise sweep from behind leaves the smallest point-to-plane
+    residual between scans 1.2 to 2 s apart (median of the inliers, averaged over six pairs: 18.6 mm;
+    uncompensated 20.7, clockwise from 165 and 195 deg 18.8 and 19.4, counter-clockwise from behind 25.1, from
+    ahead 21.3). KISS-ICP assumes it too.
 
     Args:
         points: (n, 3) m, lidar frame.
-        duration: of the sweep, s.
-        start_azimuth: atan2(y, x) at which the sweep starts, rad.
+        duration: duration of the sweep, s.
+        start_azimuth: atan2(y, x) at which the sweep starts, rad; None: see above.
         clockwise: whether the sensor turns clockwise seen from above (azimuth falls with time).
     """
     if len(points) == 0 or duration <= 0.0:
@@ -133,7 +133,7 @@ def azimuth_time(
 
 
 def ring_from_elevation(points: NDArray[np.floating[Any]], beams: int) -> NDArray[np.int32]:
-    """Return the beam of each point by its elevation, (n,); -1 where no beam of the sensor points there.
+    """Return the beam of each point by its elevation, (n,); -1 where no beam has that elevation.
 
     The beam layouts are those of A-LOAM: VLP-16 and HDL-32E count from the lowest beam, HDL-64E from the
     highest.
@@ -169,10 +169,10 @@ def ring_from_elevation(points: NDArray[np.floating[Any]], beams: int) -> NDArra
 def ring_from_azimuth_wraps(points: NDArray[np.floating[Any]]) -> NDArray[np.int32]:
     """Return the beam of each point of a file that stores ring after ring from straight ahead, (n,) from 0.
 
-    A ring ends where the azimuth in [0, 2 pi) falls back by more than an eighth of a turn: compensated scans
-    jitter by up to 11 deg, a new ring falls back by 320 deg or so. All scans at hand of KITTI raw and
-    odometry give 64 rings so, from the highest beam (2 deg) to the lowest (-24 deg); by elevation,
-    neighbouring rings mix.
+    A ring ends where the azimuth in [0, 2 pi) decreases by more than an eighth of a turn: compensated scans
+    jitter by up to 11 deg, and a new ring decreases it by about 320 deg. All scans at hand of KITTI raw and
+    odometry give 64 rings in this way, from the highest beam (2 deg) to the lowest (-24 deg). By elevation,
+    neighbouring rings would mix.
 
     Args:
         points: (n, 3) m, lidar frame, as stored by KITTI.
@@ -185,9 +185,10 @@ def ring_from_azimuth_wraps(points: NDArray[np.floating[Any]]) -> NDArray[np.int
 
 
 def guess_beams(points: NDArray[np.floating[Any]]) -> int:
-    """Return 16, 32 or 64: the layout whose lowest beam is nearest to the lowest elevation seen.
+    """Return 16, 32 or 64: the layout whose lowest beam is nearest to the lowest elevation in the scan.
 
-    The lowest beams meet the ground, so they return in almost every scene; the highest often see only sky.
+    The lowest beams meet the ground, so they return in almost every scene; the highest beams often see only
+    sky.
     """
     if len(points) == 0:
         return 16
@@ -203,7 +204,7 @@ def elevation_deg(points: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
 
 
 def _stored_ring_by_ring(turned: NDArray[np.float32]) -> bool:
-    """Tell whether an eighth of the points already looks all around, as whole rings do, a part-sweep not."""
+    """Return whether an eighth of the points covers all azimuths, as whole rings do."""
     bins = ((turned[: max(len(turned) // 8, 1)] + np.float32(np.pi)) * np.float32(36.0 / (2 * np.pi))).astype(
         int
     )
@@ -218,7 +219,7 @@ def _fraction_between_ends(turned: NDArray[np.float32]) -> NDArray[np.float32]:
     elif end - start < 0.5 * _TWO_PI:
         end += _TWO_PI
     # Points of the first half turn are unwrapped around the start, later ones around the end: near the seam
-    # an azimuth alone fits both ends of the sweep, only the place in the file tells them apart.
+    # an azimuth fits both ends of the sweep, and only the place in the file separates them.
     first = turned + _TWO_PI * ((turned < start - 0.25 * _TWO_PI).astype(np.float32))
     first -= _TWO_PI * (turned > start + 0.75 * _TWO_PI).astype(np.float32)
     past_half = first - start > 0.5 * _TWO_PI

@@ -30,21 +30,21 @@ CustomPoint[] points
 """
 _FIELD_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 _LIVOX_STRIDE = 20
-"""Bytes from one point to the next in CDR, whose uint32 are aligned; the point itself has 19."""
+"""Bytes from one point to the next in CDR, which aligns uint32; the point itself has 19."""
 
 
 class Message(NamedTuple):
-    """A message as it lies in a bag."""
+    """A serialised message with its topic and type, as a bag stores it."""
 
     topic: str
     type: str
     received_ns: int
-    """When the recorder got it."""
+    """When the recorder received it, ns."""
     raw: bytes
 
 
 class RosMessages:
-    """Builds messages for one bag; ROS 1 headers are numbered per topic."""
+    """Build the messages of one bag; ROS 1 headers are numbered per topic."""
 
     def __init__(self, ros2: bool) -> None:
         """Choose the serialisation: ROS 1, or CDR of ROS 2."""
@@ -53,7 +53,7 @@ class RosMessages:
 
     @cached_property
     def typestore(self) -> Any:
-        """Message definitions, those of tf2 and of the Livox driver included."""
+        """Message definitions, including those of tf2 and of the Livox driver."""
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         store = get_typestore(Stores.ROS2_HUMBLE if self._ros2 else Stores.ROS1_NOETIC)
@@ -69,7 +69,7 @@ class RosMessages:
         return f"livox_ros_driver{'2' if self._ros2 else ''}/msg/CustomMsg"
 
     def cloud(self, topic: str, frame: str, stamp_ns: int, points: NDArray[Any], received_ns: int) -> Message:
-        """Return a PointCloud2 of a structured array, not organised and without invalid points."""
+        """Return a PointCloud2 of a structured array, not organised, without invalid points."""
         layout = points.dtype
         fields = [
             self._make("sensor_msgs/msg/PointField", name, offset, _FIELD_TYPES[dtype.str[1:]], 1)
@@ -84,7 +84,7 @@ class RosMessages:
     def custom_cloud(
         self, topic: str, frame: str, stamp_ns: int, points: NDArray[Any], received_ns: int
     ) -> Message:
-        """Return a Livox CustomMsg; its points are copied as bytes, rosbags would make an object of each."""
+        """Return a Livox CustomMsg; points are copied as bytes: rosbags would make an object of each one."""
         rsvd = np.zeros(3, np.uint8)
         header = self._header(topic, frame, stamp_ns)
         empty = self._message(topic, received_ns, self.livox_type, header, stamp_ns, 0, 0, rsvd, [])
@@ -92,7 +92,7 @@ class RosMessages:
         rows = np.zeros((count, _LIVOX_STRIDE if self._ros2 else size), np.uint8)
         rows[:, :size] = points.view(np.uint8).reshape(count, size)
         behind_last = rows.shape[1] - size if count else 0
-        # an empty message ends with uint32 point_num, four bytes of lidar_id and rsvd, uint32 length
+        # an empty message ends with uint32 point_num, four bytes of lidar_id and rsvd, and uint32 length
         number = struct.pack("<I", count)
         raw = empty.raw[:-12] + number + empty.raw[-8:-4] + number + rows.tobytes()
         return empty._replace(raw=raw[: len(raw) - behind_last])
@@ -106,7 +106,7 @@ class RosMessages:
         accel: NDArray[np.float64],
         orientation: NDArray[np.float64] | None,
     ) -> Message:
-        """Return an Imu; without an orientation its covariance begins with -1, as the definition asks."""
+        """Return an Imu; without an orientation its covariance begins with -1, as the definition demands."""
         unknown, stated = np.zeros(9), np.zeros(9)
         if orientation is None:
             stated[0] = -1.0

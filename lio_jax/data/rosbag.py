@@ -1,4 +1,4 @@
-"""Read ROS 1 and ROS 2 bags as a Sequence: clouds streamed, inertial and GPS samples gathered in one pass."""
+"""Read ROS 1 and ROS 2 bags as a Sequence: clouds are streamed, IMU and GPS samples are read in one pass."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -45,15 +45,15 @@ _GPS_NAMES = ("gps", "gnss", "rtk")
 class RosbagSequence:
     """A bag, or a folder of the split bags of one recording.
 
-    Each pass over the data opens the bag anew, so scans may be decoded on one thread while another asks for
+    Each pass over the data opens the bag again, so one thread may decode scans while another asks for
     inertial samples. Notes about IMU and GPS join :attr:`info` once these have been read.
     """
 
     def __init__(self, path: Path, config: DataConfig) -> None:
-        """Choose topics and settle from the first clouds how they are read.
+        """Choose topics, and settle from the first clouds how they are read.
 
         Raises:
-            LioJaxError: no bag, a damaged bag, no point clouds, or a topic or field that is not there.
+            LioJaxError: no bag, a damaged bag, no point clouds, or a topic or field that is not in the bag.
         """
         self._path, self._config = path, config
         self._paths = bag_paths(path)
@@ -89,10 +89,10 @@ class RosbagSequence:
         return self._warnings.sentences
 
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
-        """Yield scans ``start`` to ``start + count`` by their place in the bag; an empty one has n = 0.
+        """Yield scans ``start`` to ``start + count`` by their place in the bag; an empty scan has n = 0.
 
-        Where the bag turns out to be damaged the iteration ends with a warning; a single message that cannot
-        be decoded, a duplicate, a step back in time and a wrong stamp are left out with a warning.
+        If the bag turns out to be damaged, the iteration ends with a warning. A message that cannot be
+        decoded, a duplicate, a step back in time and a wrong stamp are left out with a warning.
         """
         yield from in_time_order(self._decoded(start, count), self._warnings.add)
 
@@ -115,8 +115,8 @@ class RosbagSequence:
     def within(self, start_ns: int, end_ns: int) -> "RosbagSequence":
         """Return the part whose messages were received from ``start_ns`` up to ``end_ns``.
 
-        It is found by the bag's index, without reading what lies before. Its scans count from 0;
-        ``info.scan_count`` is still the whole bag's.
+        The part is found by the bag's index, without reading the messages before it. Its scans count from 0;
+        ``info.scan_count`` is still that of the whole bag.
         """
         part = copy(self)
         part._received, part._samples, part._warnings = (start_ns, end_ns), None, WarningLog()
@@ -124,14 +124,14 @@ class RosbagSequence:
         return part
 
     def contents(self) -> BagContents:
-        """Return what the bag says about itself; only its first cloud is looked at."""
+        """Return what the bag's index and its first cloud state."""
         fields: tuple[str, ...] = ()
         with open_bag(self._paths) as reader:
             for _, raw in self._lidar_messages(reader):
                 if self._lidar.type in pointcloud2.LIVOX_TYPES:
                     fields = pointcloud2.custom_msg_field_names()
                 else:
-                    # a damaged message was reported where it is decoded
+                    # a damaged message is reported where it is decoded
                     with suppress(Exception):
                         fields = pointcloud2.field_names(reader.deserialize(raw, self._lidar.type))
                 break
@@ -189,13 +189,13 @@ class RosbagSequence:
         return lidar
 
     def _extrinsic(self, reader: "AnyReader", topics: tuple[Topic, ...]) -> NDArray[np.float64] | None:
-        """Return what the bag's static transforms say of the lidar's pose on the IMU, if anything."""
+        """Return the lidar's pose in the IMU frame if the bag's static transforms state it."""
         static = [topic for topic in topics if (topic.name, topic.type) == _STATIC]
         if self._imu_topic is None or not static:
             return None
         frames = [self._frame(reader, topic) for topic in (self._imu_topic, self._lidar)]
         if None in frames or frames[0] == frames[1]:
-            # drivers left at their defaults share one frame's name
+            # drivers with default settings share one frame name
             return None
         imu, lidar = map(str, frames)
 
@@ -206,7 +206,7 @@ class RosbagSequence:
         decoded = (reader.deserialize(raw, static_transforms.TYPE) for _, _, raw in messages)
         try:
             T_imu_lidar = transform_between(gathered(decoded), imu, lidar)
-        # The generated decoders raise struct, index or their own errors on damaged bytes.
+        # The generated decoders raise exceptions of many kinds on damaged bytes.
         except Exception as error:
             broken(str(error))
             return None
@@ -223,7 +223,7 @@ class RosbagSequence:
         return None
 
     def _choose_gps(self, topics: tuple[Topic, ...]) -> Topic | None:
-        """Take an Odometry as GPS unasked only if its name says so: most are some estimator's output."""
+        """Take an Odometry as GPS only if asked for or named so: most are the output of an estimator."""
         if self._config.gps_topic:
             return self._choose("gps_topic", self._config.gps_topic, topics, _GPS_TYPES)
         fixes = tuple(topic for topic in topics if topic.type == navigation_messages.FIX_TYPE)
@@ -271,7 +271,7 @@ class RosbagSequence:
             for connection, _, raw in until_damage(self._messages(reader, *topics), broken):
                 try:
                     take[connection.topic](raw)
-                # The generated decoders raise struct, index or their own errors on damaged bytes.
+                # The generated decoders raise exceptions of many kinds on damaged bytes.
                 except Exception:
                     unreadable[connection.topic] += 1
         for name, number in unreadable.items():

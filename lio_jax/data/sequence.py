@@ -1,4 +1,4 @@
-"""What a recording is: one protocol for all formats."""
+"""The protocol that all recordings share, and the data they hold."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,43 +11,43 @@ from lio_jax.data.trajectory import Trajectory
 
 
 class WarningLog:
-    """Collect sentences in the order they first came up."""
+    """Collect sentences, each once, in the order in which they first occurred."""
 
     def __init__(self) -> None:
         self._sentences: dict[str, None] = {}
 
     def add(self, sentence: str) -> None:
-        """Remember ``sentence`` unless it was said before."""
+        """Remember ``sentence`` unless it is known already."""
         self._sentences[sentence] = None
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """All sentences so far; safe to ask while another thread decodes."""
+        """All sentences so far; it may be read while another thread decodes."""
         return tuple(self._sentences.copy())
 
 
 @dataclass(frozen=True)
 class LidarScan:
-    """One sweep as it was recorded, NaN, infinite and zero returns already dropped."""
+    """One sweep as it was recorded, without NaN, infinite and zero returns."""
 
     stamp_ns: int
     """Absolute time of the scan's start, ns."""
     points: NDArray[np.float32]
-    """(n, 3) m, lidar frame at each point's own firing time."""
+    """Points in the lidar frame at each point's own firing time, (n, 3) m."""
     time: NDArray[np.float32]
-    """(n,) s from the scan's start, within [0, duration]."""
+    """Time of each point from the scan's start, (n,) s, within [0, duration]."""
     ring: NDArray[np.int32]
-    """(n,) beam index."""
+    """Beam index of each point, (n,)."""
     intensity: NDArray[np.float32]
-    """(n,) as the sensor reports it."""
+    """Intensity in the sensor's scale, (n,)."""
     duration: float
-    """s from scan start to scan end; 0 for a sweep that is already motion compensated."""
+    """Time from scan start to scan end, s; 0 for a sweep that is already motion compensated."""
     dropped: int = 0
-    """Number of firings that were recorded without a return: NaN, infinite or zero."""
+    """Number of recorded firings without a return: NaN, infinite or zero."""
 
     @property
     def end_ns(self) -> int:
-        """Absolute time of the scan's end, ns: the instant a scan pose refers to."""
+        """Absolute time of the scan's end, ns: the instant to which the scan's pose refers."""
         return self.stamp_ns + round(self.duration * 1e9)
 
 
@@ -56,12 +56,13 @@ class ImuData:
     """All inertial samples of a recording, in time order."""
 
     stamp_ns: NDArray[np.int64]
+    """Absolute time of each sample, (m,) ns, ascending."""
     gyro: NDArray[np.float64]
-    """(m, 3) rad/s, IMU frame."""
+    """Angular rate, (m, 3) rad/s, IMU frame."""
     accel: NDArray[np.float64]
-    """(m, 3) m/s^2, specific force: +g upwards at rest."""
+    """Specific force, (m, 3) m/s^2, IMU frame; +g upwards at rest."""
     orientation: NDArray[np.float64] | None = None
-    """(m, 4) quaternion xyzw of T_world_imu from a 9-axis unit."""
+    """Quaternion xyzw of T_world_imu from a 9-axis unit, (m, 4); None where the unit has none."""
 
 
 @dataclass(frozen=True)
@@ -69,12 +70,13 @@ class GpsData:
     """All GPS fixes of a recording in a local east-north-up frame around ``origin``."""
 
     stamp_ns: NDArray[np.int64]
+    """Absolute time of each fix, (m,) ns, ascending."""
     position: NDArray[np.float64]
-    """(m, 3) m, ENU."""
+    """Position, (m, 3) m, ENU."""
     covariance: NDArray[np.float64]
-    """(m, 3, 3) m^2."""
+    """Covariance of the position, (m, 3, 3) m^2, ENU."""
     origin: tuple[float, float, float]
-    """Latitude deg, longitude deg, altitude m of the frame's origin; NaN where only local positions exist."""
+    """Latitude (deg), longitude (deg), altitude (m) of the frame's origin; NaN where positions are local."""
 
 
 @dataclass(frozen=True)
@@ -82,17 +84,17 @@ class SequenceInfo:
     """What is known about a recording before its first scan is decoded."""
 
     name: str
-    """Short name for titles and file names."""
+    """Short name of the recording for titles and file names."""
     format: str
     """Reader that opened it: kitti_odometry, kitti_raw, rosbag or native."""
     path: str
     scan_count: int
     T_imu_lidar: NDArray[np.float64] | None = None
-    """(4, 4) from the recording's calibration; None where it holds none."""
+    """Pose of the lidar in the IMU frame, (4, 4), from the recording's calibration; None where unknown."""
     sensor: str = ""
     """Sensor model where it is known."""
     notes: tuple[str, ...] = field(default_factory=tuple)
-    """One sentence for each thing that was recognised, assumed or repaired while opening."""
+    """One sentence for each thing that was recognised, assumed or repaired on opening."""
 
 
 class Sequence(Protocol):

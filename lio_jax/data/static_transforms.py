@@ -1,4 +1,4 @@
-"""The extrinsic T_imu_lidar from the frames that a bag's /tf_static ties together."""
+"""The extrinsic T_imu_lidar from the frames that a bag's /tf_static connects."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -14,11 +14,11 @@ _DEFINITION = "geometry_msgs/TransformStamped[] transforms\n"
 
 _Array = NDArray[np.float64]
 Transforms = dict[tuple[str, str], _Array]
-"""(parent, child) -> (4, 4) T_parent_child."""
+"""Transforms T_parent_child, (4, 4), by (parent, child)."""
 
 
 def register_type(typestore: Any) -> None:
-    """Make the type known to a store of rosbags that was built without it."""
+    """Register the message type with a store of rosbags that lacks it."""
     from rosbags.typesys import get_types_from_msg
 
     if TYPE not in typestore.types:
@@ -26,9 +26,9 @@ def register_type(typestore: Any) -> None:
 
 
 def gathered(messages: Iterable[Any]) -> Transforms:
-    """Return the transforms of deserialised TFMessages, a later one in place of an earlier one.
+    """Return the transforms of deserialised TFMessages; a later transform replaces an earlier one.
 
-    One that is no rigid motion (not finite, a quaternion that is not of unit length) is left out.
+    A transform that is not a rigid motion (not finite, quaternion not of unit length) is left out.
     """
     found: Transforms = {}
     for message in messages:
@@ -50,12 +50,12 @@ def frame_name(name: str) -> str:
 
 
 def transform_between(transforms: Transforms, target: str, source: str) -> _Array | None:
-    """Return the (4, 4) T_target_source along the tree of frames; None where nothing connects both.
+    """Return the (4, 4) T_target_source along the tree of frames; None where it does not connect them.
 
     Args:
-        transforms: that are known.
-        target: frame to which points are carried.
-        source: frame in which they are given.
+        transforms: the known transforms.
+        target: frame in which points are wanted.
+        source: frame in which points are given.
     """
     neighbours: dict[str, list[tuple[str, _Array]]] = {}
     for (parent, child), T_parent_child in transforms.items():

@@ -1,4 +1,4 @@
-"""Keep scans in time order: a map must never be fed the past twice, nor one wrong stamp end a recording."""
+"""Keep scans in time order, so that a map gets no scan twice and one wrong stamp does not end a recording."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
@@ -10,32 +10,32 @@ T = TypeVar("T")
 
 _LEAP_NS = 1_000_000_000
 _LEAP_STEPS = 3
-"""A step ahead longer than this, or than so many of the last step, waits for what follows: is it a gap in the
-recording, or a wrong stamp?"""
+"""A step ahead longer than this many times the last step waits for the next scans: gap or wrong stamp."""
 _FIRST_LEAP_NS = 300_000_000
-"""The same while no step is known: so many steps at the 10 Hz at which most lidars turn."""
+"""Longest believed step while no step is known, ns: three steps at 10 Hz, the rate of most lidars."""
 _LONGEST_GAP_NS = 3600 * 1_000_000_000
-"""At a recording's ends, where nothing lies on the other side to tell, a longer step is a wrong stamp."""
+"""Longest believed step at a recording's ends, ns: there, scans on one side only can confirm a stamp."""
 
 
 class Stamped(NamedTuple, Generic[T]):
-    """Something with a time."""
+    """An item with a time and a name."""
 
     stamp_ns: int
+    """Time of the item, ns."""
     name: str
-    """How a warning calls it."""
+    """Name of the item in warnings."""
     item: T
 
 
 def in_time_order(recorded: Iterable[Stamped[T]], warn: Callable[[str], None]) -> Iterator[T]:
     """Yield the items whose stamps ascend strictly.
 
-    Left out and reported, one sentence each: duplicates, steps back in time, and single stamps far ahead of
-    those that follow.
+    Duplicates, steps back in time, and single stamps far ahead of the stamps that follow are left out, with
+    one sentence each.
 
     Args:
-        recorded: in recorded order; read up to three ahead.
-        warn: called with each sentence.
+        recorded: items in recorded order; up to three of them are read ahead.
+        warn: function that takes each sentence.
     """
     latest: Stamped[None] | None = None
     waiting: Stamped[T] | None = None
@@ -67,13 +67,13 @@ def in_time_order(recorded: Iterable[Stamped[T]], warn: Callable[[str], None]) -
 
 
 def ascending(stamps_ns: Sequence[int]) -> list[int]:
-    """Return the places of the stamps that :func:`in_time_order` keeps."""
+    """Return the indices of the stamps that :func:`in_time_order` keeps."""
     numbered = (Stamped(stamp, "", place) for place, stamp in enumerate(stamps_ns))
     return list(in_time_order(numbered, lambda sentence: None))
 
 
 def _leap(current: Stamped[Any], latest: Stamped[Any] | None) -> int:
-    """Return the longest step, ns, that is believed after the one from ``latest`` to ``current``."""
+    """Return the longest believed step (ns) after the step from ``latest`` to ``current``."""
     if latest is None:
         return _FIRST_LEAP_NS
     return min(_LEAP_NS, _LEAP_STEPS * (current.stamp_ns - latest.stamp_ns))
@@ -82,7 +82,7 @@ def _leap(current: Stamped[Any], latest: Stamped[Any] | None) -> int:
 def _without_a_wrong_start(
     recorded: Iterator[Stamped[T]], warn: Callable[[str], None]
 ) -> Iterator[Stamped[T]]:
-    """Leave out a first item on whose stamp the next two agree that it is wrong."""
+    """Leave out the first item if the next two items agree that its stamp is wrong."""
     head = list(islice(recorded, 3))
     if len(head) == 3:
         first, second, third = (entry.stamp_ns for entry in head)

@@ -1,4 +1,4 @@
-"""Time-stamped poses on the host, and the two text formats the field exchanges them in."""
+"""Time-stamped poses on the host, and the two text formats in which the field exchanges them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,21 +16,21 @@ class Trajectory:
     """Poses T_world_body at int64 nanosecond stamps."""
 
     stamp_ns: NDArray[np.int64]
-    """(n,) ascending."""
+    """Stamp of each pose, (n,) ns, ascending."""
     poses: NDArray[np.float64]
-    """(n, 4, 4) T_world_body."""
+    """Poses T_world_body, (n, 4, 4), m."""
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
 
     @property
     def positions(self) -> NDArray[np.float64]:
-        """(n, 3) m, in world."""
+        """Return the positions in the world frame, (n, 3) m."""
         return self.poses[:, :3, 3]
 
     @property
     def quaternions(self) -> NDArray[np.float64]:
-        """(n, 4) xyzw of the rotations world from body."""
+        """Return the rotations world from body as quaternions xyzw, (n, 4)."""
         return Rotation.from_matrix(self.poses[:, :3, :3]).as_quat()
 
     def times_body(self, T_body_other: NDArray[np.float64]) -> "Trajectory":
@@ -38,15 +38,15 @@ class Trajectory:
         return Trajectory(self.stamp_ns, self.poses @ T_body_other)
 
     def at(self, stamp_ns: NDArray[np.int64]) -> "Trajectory":
-        """Interpolate at the stamps that lie within the trajectory's span; others are left out.
+        """Interpolate at the stamps that are within the trajectory's span; leave out the others.
 
-        Rotation by slerp, position linearly between neighbouring poses.
+        Rotations by slerp, positions linearly between neighbouring poses.
         """
         stamp_ns = np.asarray(stamp_ns, np.int64)
         inside = stamp_ns[(stamp_ns >= self.stamp_ns[0]) & (stamp_ns <= self.stamp_ns[-1])]
         if len(self) == 1 or inside.size == 0:
             return Trajectory(inside, np.repeat(self.poses[:1], inside.size, axis=0))
-        # those around the stamps alone: a query for a moment must not cost the whole trajectory
+        # only the poses around the stamps: a query for one moment must not cost time for the whole trajectory
         first = min(np.searchsorted(self.stamp_ns, inside.min(), "right") - 1, len(self) - 2)
         last = max(np.searchsorted(self.stamp_ns, inside.max(), "left"), first + 1)
         near = slice(first, last + 1)

@@ -1,4 +1,4 @@
-"""Point files of KITTI: binary float32 or text rows ``x y z intensity``, and what to do with broken ones."""
+"""Point files of KITTI, binary float32 or text rows ``x y z intensity``; broken files are handled."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -45,8 +45,8 @@ def listed(numbers: list[int], digits: int) -> str:
 def read_returns(path: Path, warn: Callable[[str], None]) -> NDArray[np.float32] | None:
     """Read the valid returns of one point file: (n, 4) x, y, z in m and intensity.
 
-    NaN, infinite and zero points are dropped. An empty file gives an empty scan, a truncated one its whole
-    points, both with a warning; a file that cannot be read at all gives None with a warning.
+    NaN, infinite and zero points are dropped. An empty file gives an empty scan, and a truncated file gives
+    its whole points, both with a warning. A file that cannot be read at all gives None with a warning.
     """
     try:
         rows = _read_text(path, warn) if path.suffix == ".txt" else _read_binary(path, warn)
@@ -58,14 +58,14 @@ def read_returns(path: Path, warn: Callable[[str], None]) -> NDArray[np.float32]
 
 
 def check_sizes(paths: Iterable[Path], warn: Callable[[str], None]) -> None:
-    """Warn of empty and truncated binary files without reading them, as :func:`read_returns` will."""
+    """Warn of empty and truncated binary files as :func:`read_returns` will, without reading them."""
     for path in paths:
         if path.suffix == ".bin":
             _check_size(path, path.stat().st_size, warn)
 
 
 def hdl64_ring(points: NDArray[np.float32]) -> NDArray[np.int32]:
-    """Return the beams by storage order; by elevation where the file's order is not KITTI's."""
+    """Return the beams by storage order, or by elevation where the order is not that of KITTI."""
     ring = ring_from_azimuth_wraps(points)
     if ring.size and ring[-1] >= _HDL64_BEAMS:
         return ring_from_elevation(points, _HDL64_BEAMS)

@@ -1,4 +1,4 @@
-"""Files and folders of a recording appear under their name complete, or not at all."""
+"""Make files and folders appear under their name complete, or not at all."""
 
 import os
 import shutil
@@ -14,7 +14,7 @@ _KINDS = {"meta.yaml": "native recording", "metadata.yaml": "ROS 2 bag", "times.
 
 
 def check_free(path: Path, overwrite: bool, marker: str = "") -> None:
-    """Refuse a path that is taken.
+    """Refuse a path that exists already.
 
     Args:
         path: file or folder to be written.
@@ -37,25 +37,25 @@ def check_free(path: Path, overwrite: bool, marker: str = "") -> None:
 
 @contextmanager
 def written_whole(path: Path, overwrite: bool = False, marker: str = "") -> Iterator[Path]:
-    """Yield a path in a hidden folder beside ``path``; move what was made there into place if all went well.
+    """Yield a path in a hidden folder next to ``path``; move the result into place if the block ends well.
 
-    Whatever ends the block early (an error, Ctrl-C, a full disk) leaves neither ``path`` nor that folder; the
-    folder of a killed process is removed by the next one that writes ``path``.
+    If the block ends early (an error, Ctrl-C, a full disk), neither ``path`` nor the hidden folder remains.
+    The folder of a killed process is removed by the next process that writes ``path``.
 
     Args:
-        path: of the file or folder.
+        path: the file or folder to write.
         overwrite, marker: as for :func:`check_free`.
 
     Raises:
         UsageError: ``path`` exists and may not be replaced.
-        LioJaxError: the disk takes no more.
+        LioJaxError: the disk is full or cannot be written.
     """
     check_free(path, overwrite, marker)
     hidden = aside_of(path)
     try:
         with disk_errors_said(path, hidden), ExitStack() as held:
             hidden.mkdir(parents=True)
-            # tells the next writer that this one lives
+            # the lock shows the next writer that this process lives
             held.enter_context(folder_lock(hidden))
             remove_leftovers(path)
             yield hidden / path.name
@@ -66,11 +66,11 @@ def written_whole(path: Path, overwrite: bool = False, marker: str = "") -> Iter
 
 @contextmanager
 def disk_errors_said(path: Path, written: Path | None = None) -> Iterator[None]:
-    """Turn what the system says about writing ``path`` into one sentence.
+    """Turn the system's errors on writing ``path`` into one sentence.
 
     Args:
-        path: how the sentence calls what is written.
-        written: where it is written for now; None: at ``path``. Errors about other files pass as they are.
+        path: the name of the output in the sentence.
+        written: path that is written meanwhile; None: ``path``. Errors on other files are raised unchanged.
 
     Raises:
         LioJaxError: the block met an error of the file system.
@@ -78,7 +78,7 @@ def disk_errors_said(path: Path, written: Path | None = None) -> Iterator[None]:
     try:
         yield
     except (OSError, sqlite3.Error) as error:
-        # a full disk is met in write(), which names no file
+        # an error in write(), for example on a full disk, names no file
         named = getattr(error, "filename", None)
         if named is not None and not str(named).startswith(str(written or path)):
             raise
@@ -90,7 +90,7 @@ def disk_errors_said(path: Path, written: Path | None = None) -> Iterator[None]:
 
 
 def _put_in_place(made: Path, path: Path, old: Path) -> None:
-    """Rename ``made`` to ``path``; a folder cannot be renamed onto, so one that is there moves to ``old``."""
+    """Rename ``made`` to ``path``; a folder that exists there is first moved to ``old``."""
     if not path.is_dir():
         os.replace(made, path)
         return

@@ -1,4 +1,4 @@
-"""The rigid motion that lays an estimate onto a reference before absolute errors are taken."""
+"""The rigid transform that aligns an estimate with a reference before absolute errors are computed."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-# A reference that stays within this rms distance of its mean (m) gives positions no direction to align by.
+# A reference whose rms distance from its mean (m) is below this gives no direction for an alignment.
 _STANDING_SPREAD_M = 0.05
 # Positions fix the rotation about the path's main direction to about residual / sideways spread, rad.
 _UNRELIABLE_ROTATION_RAD = 0.25
@@ -16,26 +16,27 @@ Method = Literal["umeyama", "first_pose"]
 
 @dataclass(frozen=True)
 class Alignment:
-    """World-to-world transforms which map the estimate's world to the reference's."""
+    """Transforms from the estimate's world to the reference's world."""
 
     T_reference_estimate: NDArray[np.float64]
-    """(4, 4), for positions."""
+    """Transform for positions, (4, 4)."""
     method: Method
     T_reference_estimate_attitude: NDArray[np.float64]
-    """(4, 4), for attitudes; differs where positions leave the rotation about the path open."""
+    """Transform for attitudes, (4, 4); it differs where positions do not fix the rotation about the path."""
     notes: tuple[str, ...]
 
 
 def align(estimate: NDArray[np.float64], reference: NDArray[np.float64]) -> Alignment:
     """Align by least squares on positions (SE3 Umeyama, no scale), where the path allows it.
 
-    A standing vehicle or fewer than three poses are aligned by the first pose instead. A path so straight,
-    for the size of the error, that positions do not fix the rotation about it keeps the least-squares
-    alignment for positions, and has its attitudes aligned by the first pose. Both are said in ``notes``.
+    If the vehicle stands still, or with fewer than three poses, the first poses are aligned instead. If the
+    path is so straight, for the size of the error, that the rotation about it is not observable from
+    positions, the least-squares alignment is kept for positions only; attitudes are aligned by the first
+    pose. ``notes`` reports both cases.
 
     Args:
-        estimate: (n, 4, 4) T_world_body, n >= 1.
-        reference: (n, 4, 4) at the same instants, of the same body frame.
+        estimate: (n, 4, 4) T_world_body, m, n >= 1.
+        reference: (n, 4, 4) poses of the same body frame at the same instants, m.
     """
     by_first_pose = reference[0] @ np.linalg.inv(estimate[0])
     centred = reference[:, :3, 3] - reference[:, :3, 3].mean(axis=0)
@@ -77,7 +78,7 @@ def _umeyama(estimate: NDArray[np.float64], reference: NDArray[np.float64]) -> N
     try:
         rotation, translation, _ = umeyama_alignment(estimate.T, reference.T, with_scale=False)
     except GeometryException:
-        # evo refuses collinear positions, although any of the equally good rotations serves positions.
+        # evo refuses collinear positions, although each of the equally good rotations would serve positions.
         rotation, translation = _kabsch(estimate, reference)
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = rotation, translation

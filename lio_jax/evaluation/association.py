@@ -1,4 +1,4 @@
-"""Which reference pose belongs to which estimated pose."""
+"""Find the reference pose that belongs to each estimated pose."""
 
 from dataclasses import dataclass
 
@@ -9,23 +9,23 @@ from lio_jax.core.errors import LioJaxError
 from lio_jax.core.timestamps import ns_to_seconds
 from lio_jax.data.trajectory import Trajectory
 
-# Text files round stamps (KITTI's times.txt keeps 6 digits): this far outside the span is still its end.
+# Text files round stamps (KITTI's times.txt has 6 digits): this close to the span's end counts as its end.
 _SPAN_TOLERANCE_NS = 100_000
-# Interpolating over a longer hole in the reference would invent truth.
+# Interpolation over a longer hole in the reference would invent truth.
 _GAP_SECONDS = 1.0
 _GAP_MEDIAN_PERIODS = 5.0
-# Squares of what a diverged filter writes overflow: beyond this a position counts as not finite.
+# A diverged filter's positions overflow when squared: a position beyond this counts as not finite.
 _FARTHEST_M = 1e9
 
 
 @dataclass(frozen=True)
 class MatchedTrajectories:
-    """Estimate and reference at the same instants, one reference pose for each estimated pose."""
+    """Estimate and reference at the same instants, with one reference pose for each estimated pose."""
 
     estimate: Trajectory
     reference: Trajectory
     notes: tuple[str, ...]
-    """One sentence for each group of poses that was left out or assumed to match."""
+    """One sentence for each group of poses that was left out or was paired by assumption."""
 
     def __len__(self) -> int:
         return len(self.estimate)
@@ -37,10 +37,10 @@ def match_by_time(
     estimate_name: str = "the estimate",
     reference_name: str = "the reference",
 ) -> MatchedTrajectories:
-    """Interpolate the reference at the estimate's stamps, where it has poses on both sides.
+    """Interpolate the reference at those stamps of the estimate that have reference poses on both sides.
 
-    Left out and counted in ``notes``: poses outside the reference's span, in holes of the reference (longer
-    than 1 s and than 5 of its median periods), and poses that are not finite.
+    A pose is left out if it is outside the reference's span, in a hole of the reference (longer than 1 s and
+    than 5 of its median periods), or not finite. ``notes`` counts these poses.
 
     Raises:
         LioJaxError: nothing is left to compare; the sentence names both time spans.
@@ -78,7 +78,7 @@ def match_by_index(
     estimate_name: str = "the estimate",
     reference_name: str = "the reference",
 ) -> MatchedTrajectories:
-    """Pair the i-th pose with the i-th pose, for files without stamps.
+    """Pair the poses by their index, for files without stamps.
 
     Raises:
         LioJaxError: the lengths differ, or no pair is finite.
@@ -87,7 +87,7 @@ def match_by_index(
         raise LioJaxError(
             f"{estimate_name} holds {len(estimate)} poses and {reference_name} {len(reference)}, and without "
             "stamps they can only be paired one to one; give trajectories with stamps (TUM), put a times.txt "
-            "beside the KITTI pose file, or cut both to the same scans."
+            "into the KITTI pose file's folder, or cut both to the same scans."
         )
     finite = _finite_rows(estimate) & _finite_rows(reference)
     notes: tuple[str, ...] = ("Poses were paired by their index, because there are no stamps to match by.",)
@@ -113,7 +113,7 @@ def _in_gap(stamps: NDArray[np.int64], knots: NDArray[np.int64]) -> NDArray[np.b
 
 
 def _finite_rows(trajectory: Trajectory) -> NDArray[np.bool_]:
-    # Not below the limit are NaN and infinity, too.
+    # The negated comparison also covers NaN and infinity.
     return np.asarray((np.abs(trajectory.poses) < _FARTHEST_M).all(axis=(1, 2)))
 
 

@@ -1,4 +1,4 @@
-"""Is a filter as sure as it is right: normalised squared errors and their chi-square bands."""
+"""Consistency of a filter: normalised squared errors and their chi-square bands."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,13 +10,13 @@ from lio_jax.core.errors import UsageError
 def nees(error: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the normalised estimation error squared, error' covariance^-1 error.
 
-    Of a consistent filter it is chi-square with d degrees of freedom. For the normalised innovation squared
-    give innovations and their covariances (Bar-Shalom, Li & Kirubarajan, "Estimation with applications to
-    tracking and navigation", 2001, section 5.4).
+    For a consistent filter it has a chi-square distribution with d degrees of freedom. For the normalised
+    innovation squared, pass innovations and their covariances (Bar-Shalom, Li & Kirubarajan, "Estimation with
+    applications to tracking and navigation", 2001, section 5.4).
 
     Args:
-        error: (..., d) truth minus estimate in the tangent space at the estimate.
-        covariance: (..., d, d) what the filter claims.
+        error: (..., d) truth minus estimate, in the tangent space at the estimate.
+        covariance: (..., d, d) covariance that the filter states.
 
     Raises:
         UsageError: a covariance is not positive definite: leave frozen parts of the state out.
@@ -31,12 +31,12 @@ def nees(error: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray
 
 
 def average_band(dof: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
-    """Return the two-sided band in which the average over independent runs lies with a probability.
+    """Return the two-sided band that contains the average over independent runs with a given probability.
 
     Args:
-        dof: degrees of freedom of each value.
-        runs: number of independent values averaged.
-        probability: between 0 and 1.
+        dof: number of degrees of freedom of each value.
+        runs: number of independent values in the average.
+        probability: probability of the band, between 0 and 1.
     """
     if dof < 1 or runs < 1 or not 0 < probability < 1:
         raise UsageError(

@@ -1,4 +1,4 @@
-"""Score a trajectory against another one, and say so in a table."""
+"""Compare a trajectory with a reference, and write the errors as a table."""
 
 import dataclasses
 import math
@@ -24,13 +24,13 @@ class Evaluation:
     """The errors of one trajectory against a reference; translations in m, rotations in rad."""
 
     matched: int
-    """Estimated poses that have a reference pose."""
+    """Number of estimated poses that have a reference pose."""
     poses: int
-    """Estimated poses in all."""
+    """Number of all estimated poses."""
     path_length_m: float
-    """Of the reference, over the matched poses."""
+    """Length of the reference over the matched poses, m."""
     duration_s: float | None
-    """From the first to the last matched pose; None where there are no stamps."""
+    """Time from the first to the last matched pose, s; None where there are no stamps."""
     alignment: Method
     """How absolute errors were aligned."""
     ate: PoseError
@@ -38,16 +38,16 @@ class Evaluation:
     rpe: PoseError | None
     """Relative pose error from each matched pose to the next; None for a single pose."""
     rpe_by_distance: dict[str, PoseError | None]
-    """Relative pose error per travelled distance, keyed like "10 m"."""
+    """Relative pose error by travelled distance; keys have the form "10 m"."""
     kitti: SegmentErrors | None
     """The KITTI benchmark's drift over 100 to 800 m; None for shorter paths."""
     kitti_short_10_80m: SegmentErrors | None
-    """The same over 10 to 80 m, for short runs only: not comparable with the benchmark."""
+    """Drift over segments of 10 to 80 m, for short runs only: not comparable with the KITTI benchmark."""
     notes: tuple[str, ...]
     """One sentence for each thing a reader must know to trust the numbers."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the same as plain JSON values; what is not finite becomes null."""
+        """Return the errors as plain JSON values; a value that is not finite becomes null."""
         plain: dict[str, Any] = _plain(dataclasses.asdict(self))
         return plain
 
@@ -57,9 +57,10 @@ def evaluate(
 ) -> Evaluation:
     """Compare two trajectories of the SAME body frame; their world frames may differ.
 
-    The reference is interpolated at the estimate's stamps. Comparing T_world_imu (a run's trajectory.tum, a
-    recording's truth) with T_world_lidar (trajectory_kitti.txt) or a camera's poses adds the offset between
-    the sensors to every number: convert one with ``Trajectory.times_body`` first.
+    The reference is interpolated at the estimate's stamps. A comparison of T_world_imu (a run's
+    trajectory.tum, a recording's truth) with T_world_lidar (trajectory_kitti.txt) or with a camera's poses
+    adds the offset between the sensors to every error: convert one of them with ``Trajectory.times_body``
+    first.
 
     Raises:
         LioJaxError: the time spans do not overlap, or no pose is finite.
@@ -70,7 +71,7 @@ def evaluate(
 def evaluate_files(
     estimate_path: Path, reference_path: Path, rpe_distances_m: tuple[float, ...] = ()
 ) -> Evaluation:
-    """Load both by :func:`load_trajectory` and compare them; without stamps in either, pose by pose.
+    """Load both with :func:`load_trajectory` and compare them, pose by pose if neither has stamps.
 
     Raises:
         LioJaxError: a file cannot be read, time spans do not overlap, or lengths differ without stamps.
@@ -107,7 +108,7 @@ def _compare(
 
 
 def _body_frame_notes(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
-    """Warn where the two move along different body axes, as the poses of two different sensors do."""
+    """Warn if the two move along different body axes, as the poses of two different sensors do."""
     ours, theirs = _travel_direction(estimate), _travel_direction(reference)
     if ours is None or theirs is None or np.dot(ours, theirs) > math.cos(_BODY_AXES_RAD):
         return ()
@@ -124,7 +125,7 @@ def _body_frame_notes(estimate: Trajectory, reference: Trajectory) -> tuple[str,
 
 
 def _travel_direction(trajectory: Trajectory) -> NDArray[np.float64] | None:
-    """Return the mean direction of travel in body axes; None where there is none (standing, or both ways)."""
+    """Return the mean direction of travel in body axes; None without one (at rest, or forwards and back)."""
     steps = np.diff(trajectory.positions, axis=0)
     in_body = np.einsum("nij,ni->nj", trajectory.poses[:-1, :3, :3], steps)
     total, travelled = in_body.sum(axis=0), np.linalg.norm(steps, axis=1).sum()
@@ -145,7 +146,7 @@ def _plain(value: Any) -> Any:
 
 
 def format_evaluation(evaluation: Evaluation) -> str:
-    """Return an aligned table with units, and the notes below it."""
+    """Return an aligned table with units, followed by the notes."""
     duration = "" if evaluation.duration_s is None else f", {evaluation.duration_s:.1f} s"
     method = {"umeyama": "least squares, no scale", "first_pose": "by the first pose"}[evaluation.alignment]
     compared = f"{evaluation.matched} of {evaluation.poses} poses compared"
@@ -192,6 +193,6 @@ def _number(value: float) -> str:
     return f"{value:>11.4f}"
 
 
-# Directions of travel further apart than this are those of two sensors rather than an error.
+# Directions of travel that differ by more than this belong to two sensors; a smaller difference is an error.
 _BODY_AXES_RAD = 0.3
 _TRAVEL_FOR_DIRECTION_M = 1.0

@@ -1,4 +1,4 @@
-"""Read a trajectory from whatever holds one: TUM and KITTI text files, run folders, recordings with truth."""
+"""Read a trajectory from TUM and KITTI text files, run folders, and recordings with truth."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,24 +15,24 @@ _RUN_TRAJECTORY = "trajectory.tum"
 
 @dataclass(frozen=True)
 class LoadedTrajectory:
-    """A trajectory and how much is known about its stamps."""
+    """A trajectory, and whether its stamps are known."""
 
     trajectory: Trajectory
     stamped: bool
-    """False: the file holds no stamps and ``stamp_ns`` merely counts 0, 1, 2, ..."""
+    """Whether the file holds stamps; if False, ``stamp_ns`` only counts 0, 1, 2 and so on."""
     source: str
-    """The file or recording it was read from, for messages."""
+    """File or recording from which it was read, for messages."""
 
 
 def load_trajectory(path: Path) -> LoadedTrajectory:
     """Read the trajectory that ``path`` holds.
 
-    A run folder gives its trajectory.tum, a recording its ground truth (both T_world_imu); a text file is
-    taken for TUM (8 numbers a line) or KITTI poses (12). KITTI poses get their stamps from a times.txt beside
-    them, from ``../sequences/NN/times.txt``, or from the trajectory.tum of the same run.
+    A run folder gives its trajectory.tum, a recording its ground truth (both T_world_imu). A text file is
+    read as TUM (8 numbers a line) or as KITTI poses (12). KITTI poses get their stamps from a times.txt in
+    the same folder, from ``../sequences/NN/times.txt``, or from the trajectory.tum of the same run.
 
     Raises:
-        LioJaxError: there is nothing there, or nothing that holds a trajectory.
+        LioJaxError: nothing is there, or it holds no trajectory.
     """
     if not path.exists():
         raise LioJaxError(

@@ -22,17 +22,17 @@ class PoseError:
     """Error statistics over poses or pose pairs."""
 
     rmse: float
-    """Translation, m."""
+    """Root mean square of the translation error, m."""
     mean: float
-    """Translation, m."""
+    """Mean translation error, m."""
     max: float
-    """Translation, m."""
+    """Largest translation error, m."""
     rotation_rmse: float
-    """Rotation, rad."""
+    """Root mean square of the rotation error, rad."""
     rotation_mean: float
-    """Rotation, rad."""
+    """Mean rotation error, rad."""
     rotation_max: float
-    """Rotation, rad."""
+    """Largest rotation error, rad."""
     samples: int
     """Number of poses (absolute) or pose pairs (relative)."""
 
@@ -42,8 +42,8 @@ def absolute_error(estimate: Trajectory, reference: Trajectory, alignment: Align
 
     Args:
         estimate: T_world_body.
-        reference: of the same instants and the same body frame.
-        alignment: from :func:`lio_jax.evaluation.alignment.align`.
+        reference: T_world_body of the same body frame at the same instants.
+        alignment: result of :func:`lio_jax.evaluation.alignment.align`.
     """
     from evo.core.metrics import APE, PoseRelation
 
@@ -61,13 +61,13 @@ def relative_error(
     delta: float = 1.0,
     unit: Literal["frames", "m"] = "frames",
 ) -> PoseError | None:
-    """Return the relative pose error (RPE) over consecutive pairs ``delta`` apart; None where no pair exists.
+    """Return the relative pose error (RPE) over consecutive pairs ``delta`` apart; None without any pair.
 
     Args:
         estimate: T_world_body.
-        reference: of the same instants and the same body frame; pairs by distance are chosen along it.
-        delta: frames, or metres travelled.
-        unit: of ``delta``.
+        reference: T_world_body of the same body frame at the same instants; pairs by distance follow it.
+        delta: distance of a pair, frames or metres travelled.
+        unit: unit of ``delta``.
     """
     from evo.core.filters import FilterException
     from evo.core.metrics import RPE, PoseRelation, Unit

@@ -1,4 +1,4 @@
-"""Look a recording over before the first run."""
+"""Examine a recording before the first run."""
 
 from lio_jax.inspection.findings import Inspection, settings_text
 from lio_jax.inspection.inspect import inspect_sequence

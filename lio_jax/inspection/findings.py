@@ -1,4 +1,4 @@
-"""What an inspection finds, as plain values."""
+"""Results of an inspection, as plain values."""
 
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -11,105 +11,106 @@ class Suggestion:
     """A setting that fits the recording."""
 
     path: str
-    """Such as ``config.data.stamp_at``; ``recipe`` for the recipe."""
+    """Path of the setting, for example ``config.data.stamp_at``; ``recipe`` for the recipe."""
     value: Any
-    """None where only a person knows it."""
+    """Suggested value; None where only the user can know it."""
     reason: str
+    """Why the value fits the recording."""
     form: str = ""
-    """How the value is written where it is not known, such as [X,Y,Z]."""
+    """How to write a value that is not known, for example [X,Y,Z]."""
 
     def option(self) -> str:
-        """Return it as an option of ``lio-jax run``, its reason after '#'."""
+        """Return the suggestion as an option of ``lio-jax run``, with its reason after '#'."""
         if self.path == "recipe":
             return f"--recipe {self.value}"
         return f"--set {self.path}={self.written().replace(' ', '')}  # {self.reason}"
 
     def written(self) -> str:
-        """Return the value as YAML, or its form where it is not known."""
+        """Return the value as YAML, or the form of a value that is not known."""
         return self.form or yaml.safe_dump(self.value, default_flow_style=True, width=10_000).split("\n")[0]
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """What was found; lengths in m, times in s, rates in Hz, angular rates in rad/s."""
+    """All results; lengths in m, times in s, rates in Hz, angular rates in rad/s."""
 
     name: str
     format: str
     path: str
     sensor: str
     topics: list[dict[str, Any]]
-    """name, type, messages and rate of each topic of a bag; none of other formats."""
+    """Name, type, number of messages and rate of each topic of a bag; empty for other formats."""
     point_fields: list[str]
-    """Name and type of the fields of a point in a bag's clouds, such as "x f4"."""
+    """Name and type of each field of a point in a bag's clouds, for example "x f4"."""
     sampled: str
-    """What was left out of the look, "" where nothing was."""
+    """Sentence on the parts of the recording that were not examined; "" if all were."""
     scans: int
     duration: float | None
-    """From the first scan's start to the last one's end; None where no scan could be decoded."""
+    """Time from the first scan's start to the last scan's end, s; None where no scan could be decoded."""
     scan_rate: float | None
     scan_jitter: float | None
-    """Typical deviation of the time between scans."""
+    """Typical deviation of the time between scans, s."""
     scan_gaps: int
-    """Steps between consecutive sampled scans longer than 1.8 median ones."""
+    """Number of steps between consecutive sampled scans that are longer than 1.8 median steps."""
     points_per_scan: dict[str, float]
-    """min, median and max over the sampled scans."""
+    """Minimum, median and maximum number of points in the sampled scans."""
     dropped_share: float | None
-    """Of the recorded points: NaN, infinite or zero."""
+    """Share of the recorded points that are NaN, infinite or zero."""
     rings: int
-    """Number of different beam indices; 0 where there are none."""
+    """Number of different beam indices; 0 where the recording has none."""
     point_time: str
-    """How the times of the points in a scan are spread."""
+    """Sentence on how the times of the points are distributed in a scan."""
     scan_duration: float | None
-    """Median over the sampled scans; 0: already compensated."""
+    """Median duration of the sampled scans, s; 0: already compensated."""
     range_min: float | None
     range_max: float | None
     range_shares: dict[str, float]
-    """Share of the points by range."""
+    """Share of the points in each interval of range."""
     imu_samples: int
     imu_rate: float | None
-    """By the median interval."""
+    """Rate by the median interval, Hz."""
     imu_jitter: float | None
     imu_gaps: int
-    """Number of intervals longer than three median ones."""
+    """Number of intervals that are longer than three median intervals."""
     imu_longest_gap: float | None
     accel_magnitude: float | None
-    """Median of |accel| as the reader gives it, m/s^2."""
+    """Median of |accel| as the reader returns it, m/s^2."""
     up_in_imu: list[float] | None
-    """Unit vector of the mean specific force, at rest where there is rest."""
+    """Unit vector of the mean specific force, IMU frame; at rest if a rest was found."""
     tilt_deg: float | None
-    """Between it and the lidar's z axis by the calibration, or with parallel axes without."""
+    """Angle between ``up_in_imu`` and the lidar's z axis, deg; uncalibrated axes count as parallel."""
     at_rest: bool
-    """A second at rest was found."""
+    """Whether a second at rest was found."""
     gyro_noise: float | None
-    """Density at rest, rad/s/sqrt(Hz)."""
+    """White noise density of the gyroscope at rest, rad/s/sqrt(Hz)."""
     accel_noise: float | None
-    """Density at rest, m/s^2/sqrt(Hz)."""
+    """White noise density of the accelerometer at rest, m/s^2/sqrt(Hz)."""
     turns: dict[str, Any] | None
-    """The scans' turns against the gyroscope's; None where they cannot be compared."""
+    """Rotations of the scans compared with the gyroscope's; None where they cannot be compared."""
     gps_fixes: int
     truth_poses: int
     calibration: bool
     """Whether the recording holds T_imu_lidar."""
     missing: dict[str, list[str]]
-    """What each recipe would want and does not find."""
+    """Sentences by recipe on what the recipe needs and the recording lacks."""
     notes: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     suggestions: list[Suggestion] = field(default_factory=list)
 
     @property
     def suggested_config(self) -> list[str]:
-        """Options of ``lio-jax run`` that fit, each with its reason after '#'."""
+        """Suggested options of ``lio-jax run``, each with its reason after '#'."""
         return [suggestion.option() for suggestion in self.suggestions]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers, strings and lists for JSON."""
+        """Return plain numbers, strings and lists, for JSON."""
         return asdict(self) | {"suggested_config": self.suggested_config}
 
 
 def settings_text(found: Inspection) -> str:
-    """Return a settings file for ``--recipe``: what the inspection suggests, each with its reason.
+    """Return a settings file for ``--recipe`` with the inspection's suggestions, each with its reason.
 
-    What only a person knows stands there as a comment.
+    A value that only the user can know is left as a comment.
     """
     lines = [f"# for {found.path}", "# what is not set here keeps the recipe's value"]
     sections: dict[str, dict[str, list[Suggestion]]] = {}
@@ -120,7 +121,7 @@ def settings_text(found: Inspection) -> str:
         kind, section, _ = suggestion.path.split(".", 2)
         sections.setdefault(kind, {}).setdefault(section, []).append(suggestion)
     for kind, groups in sections.items():
-        # keys without a value that is known would hold nothing
+        # a key whose values are all unknown would be empty
         known = any(one.value is not None for group in groups.values() for one in group)
         lines.append(f"{'' if known else '# '}{kind}:")
         for section, group in groups.items():

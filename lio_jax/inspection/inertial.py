@@ -1,4 +1,4 @@
-"""What the inertial samples are like: rhythm, units, which way is up, and their noise at rest."""
+"""Properties of the inertial samples: rate, units, the direction of up, and noise at rest."""
 
 from dataclasses import dataclass, replace
 
@@ -18,43 +18,43 @@ _TILTED_DEG = 40.0
 
 @dataclass(frozen=True)
 class InertialSummary:
-    """Of all inertial samples that were read."""
+    """Properties of all inertial samples that were read."""
 
     parts: list[ImuData]
-    """In SI units, in time order, without samples that cannot be used."""
+    """Consecutive samples in each part, SI units, in time order, without samples that cannot be used."""
     samples: int
     rate: float | None
-    """Hz, by the median interval."""
+    """Rate by the median interval, Hz."""
     jitter: float | None
-    """Typical deviation of an interval from the median one, s: 1.48 median absolute deviations."""
+    """Typical deviation of an interval from the median interval, s: 1.48 median absolute deviations."""
     gaps: int
-    """Intervals longer than three median ones."""
+    """Number of intervals that are longer than three median intervals."""
     longest_gap: float | None
-    """s."""
+    """Length of the longest gap, s."""
     accel_magnitude: float | None
-    """Median of |accel| as recorded."""
+    """Median of |accel| in the units of the recording."""
     in_g: bool
     up: NDArray[np.float64] | None
-    """(3,) unit vector of the mean specific force in IMU axes, at rest where there is rest."""
+    """Unit vector of the mean specific force, (3,), IMU frame; at rest if a rest was found."""
     tilt_deg: float | None
-    """Between it and the lidar's z axis."""
+    """Angle between ``up`` and the lidar's z axis, deg."""
     still: bool
-    """A second at rest was found."""
+    """Whether a second at rest was found."""
     gyro_noise: float | None
-    """Density at rest, rad/s/sqrt(Hz)."""
+    """White noise density of the gyroscope at rest, rad/s/sqrt(Hz)."""
     accel_noise: float | None
-    """Density at rest, m/s^2/sqrt(Hz)."""
+    """White noise density of the accelerometer at rest, m/s^2/sqrt(Hz)."""
     gyro_bias: NDArray[np.float64] | None
-    """(3,) mean rate at rest, rad/s."""
+    """Mean angular rate at rest, (3,) rad/s, IMU frame."""
     problems: list[str]
 
 
 def summarised(parts: list[ImuData], T_imu_lidar: NDArray[np.float64] | None) -> InertialSummary | None:
-    """Summarise inertial samples; None where there are none.
+    """Summarise inertial samples; return None where there are none.
 
     Args:
-        parts: consecutive samples each, as recorded.
-        T_imu_lidar: (4, 4), None where unknown: the axes are then taken as parallel.
+        parts: consecutive samples in each part, as recorded.
+        T_imu_lidar: (4, 4); None where unknown: the axes are then taken as parallel.
     """
     parts = [part for part in parts if len(part.stamp_ns)]
     if not parts:
@@ -92,7 +92,7 @@ def summarised(parts: list[ImuData], T_imu_lidar: NDArray[np.float64] | None) ->
 
 
 def overlap(summary: InertialSummary, whole: bool, starts_ns: list[int], ends_ns: list[int]) -> list[str]:
-    """Return what is wrong with the samples' coverage of the scans, where all samples were read."""
+    """Return sentences on scans without inertial samples, if all samples were read."""
     if not whole or not starts_ns or not summary.parts:
         return []
     return coverage(summary.parts[0], min(starts_ns), max(ends_ns))
@@ -106,7 +106,7 @@ def _problems(rate: float | None, magnitude: float | None, in_g: bool, tilt: flo
         said.append(f"|accel| has the median {magnitude:.3f}: the accelerometer is in g.")
     elif magnitude is not None and not _SI_RANGE[0] <= magnitude <= _SI_RANGE[1]:
         said.append(f"|accel| has the median {magnitude:.2f} m/s^2, at rest it is 9.8: check its unit.")
-    # a force that points down is said with its remedy by the checks of the samples
+    # a force that points down is reported, with its remedy, by the checks of the samples
     if tilt is not None and _TILTED_DEG < tilt < 120.0:
         said.append(
             f"gravity stands {tilt:.0f} deg from the lidar's z axis: the axes of IMU and lidar differ from "
@@ -116,7 +116,7 @@ def _problems(rate: float | None, magnitude: float | None, in_g: bool, tilt: flo
 
 
 def _rhythm(parts: list[ImuData]) -> tuple[float | None, float | None, int, float | None]:
-    """Return rate in Hz, jitter in s, number of gaps, longest gap in s."""
+    """Return rate (Hz), jitter (s), number of gaps and longest gap (s)."""
     intervals = np.concatenate([np.diff(part.stamp_ns) for part in parts] or [np.zeros(0)]) * 1e-9
     if not len(intervals):
         return None, None, 0, None
@@ -133,7 +133,7 @@ def _magnitude(parts: list[ImuData]) -> float | None:
 
 
 def _up(parts: list[ImuData]) -> tuple[NDArray[np.float64] | None, ImuData | None]:
-    """Return the direction of the mean specific force and the samples at rest, None where there are none."""
+    """Return the direction of the mean specific force, and the samples at rest; None where there are none."""
     for part in parts:
         rest = still_second(part, (part.stamp_ns - part.stamp_ns[0]) * 1e-9)
         if rest is not None:
@@ -155,7 +155,7 @@ def _tilt(up: NDArray[np.float64] | None, T_imu_lidar: NDArray[np.float64] | Non
 
 
 def _density(values: NDArray[np.float64], rate: float | None) -> float | None:
-    """Return the density of white noise with the spread of the values about their mean."""
+    """Return the density of white noise that has the standard deviation of the values about their mean."""
     if not rate:
         return None
     return float(np.sqrt(np.mean(np.var(values, axis=0)) / rate))

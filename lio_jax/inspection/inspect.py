@@ -1,4 +1,4 @@
-"""Look a recording over: what is in it, what is wrong with it, which configuration fits."""
+"""Inspect a recording: its contents, its faults, and the configuration that fits it."""
 
 from typing import Any
 
@@ -21,15 +21,15 @@ from lio_jax.settings.settings import Settings
 
 _TRACKED_WINDOWS = 4
 _TRACKED_SCANS = 40
-"""Of a recording that is looked at as a whole."""
+"""Number of scans for odometry in a recording that is examined as a whole."""
 
 
 def inspect_sequence(sequence: Sequence, settings: Settings | None = None) -> Inspection:
-    """Look over a recording by its calibration, its samples and some windows of scans.
+    """Inspect a recording by its calibration, its inertial samples and some windows of scans.
 
     Args:
         sequence: the recording.
-        settings: what a run would start from; None: the defaults.
+        settings: settings that a run would start from; None: the defaults.
     """
     settings = settings or Settings()
     look = sampled(sequence)
@@ -97,7 +97,7 @@ def inspect_sequence(sequence: Sequence, settings: Settings | None = None) -> In
 
 
 def _scans(look: Sampled) -> tuple[ScanSummary, list[list[LidarScan]]]:
-    """Return the summary of the sampled scans, and thinned windows of them for odometry."""
+    """Return the summary of the sampled scans, and thinned windows of these scans for odometry."""
     summary = ScanSummary()
     tracked: list[list[LidarScan]] = []
     for window in look.windows():
@@ -109,11 +109,11 @@ def _scans(look: Sampled) -> tuple[ScanSummary, list[list[LidarScan]]]:
 
 
 def _thinned(scan: LidarScan) -> LidarScan:
-    """Return at most as many points as the odometry is compiled for, evenly drawn."""
+    """Return at most as many points as the odometry is compiled for, drawn uniformly."""
     count = len(scan.points)
     if count <= THINNED_TO:
         return scan
-    # drawn, because an even stride takes the same beams from every firing
+    # drawn at random, because an even stride would take the same beams of every firing
     chosen = np.sort(np.random.default_rng(0).choice(count, THINNED_TO, replace=False))
     return LidarScan(
         scan.stamp_ns,
@@ -126,7 +126,7 @@ def _thinned(scan: LidarScan) -> LidarScan:
 
 
 def _assumed(sequence: Sequence, settings: Settings) -> NDArray[np.float64] | None:
-    """Return the T_imu_lidar that a run would use; None where that is a guess."""
+    """Return the T_imu_lidar that a run would use; None where it is only a guess."""
     if any(path.startswith("params.extrinsics.rot") for path in settings.given):
         return np.asarray(settings.params().extrinsics.T_imu_lidar().as_matrix(), np.float64)
     return sequence.info.T_imu_lidar

@@ -1,9 +1,9 @@
-"""Do scans and gyroscope tell of the same turns: axes, signs, units and clocks, before the first run.
+"""Compare the rotations of scans and gyroscope before the first run: axes, signs, units and clocks.
 
-The scans' turns come from LiDAR odometry of a few windows. With a the angular rate in the lidar's axes and b
-in the IMU's, b = R_imu_lidar a: Wahba's problem, solved by the singular vectors of sum a b^T (Markley,
-"Attitude determination using vector observations and the singular value decomposition", 1988). Its singular
-values also tell how well two records fit whatever the rotation, and so the shift between their clocks.
+The scans' rotations come from LiDAR odometry of a few windows. With a the angular rate in the lidar's axes
+and b in the IMU's, b = R_imu_lidar a. This is Wahba's problem, solved by the singular vectors of sum a b^T
+(Markley, "Attitude determination using vector observations and the singular value decomposition", 1988). Its
+singular values measure how well two records fit under any rotation; they also yield the shift between clocks.
 """
 
 from dataclasses import dataclass
@@ -20,53 +20,53 @@ from lio_jax.settings.settings import Settings
 THINNED_TO = 16384
 _LEAST_TURNS = 6
 _LEAST_RATE = 0.03
-"""A direction about which the rate is smaller is not observed, rad/s."""
+"""A direction about which the rms rate is below this is not observable, rad/s."""
 _SHIFTS_S = np.arange(-0.5, 0.5001, 0.005)
 _DEGREES_RANGE = (40.0, 75.0)
-"""Of the ratio of the rates: deg/s read as rad/s gives 57.3."""
+"""Range of the ratio of the rates that indicates deg/s: deg/s taken as rad/s gives 57.3."""
 
 
 @dataclass(frozen=True)
 class Turns:
-    """The lidar's mean angular rate between scans."""
+    """Mean angular rates of the lidar between scans."""
 
     start_ns: NDArray[np.int64]
     end_ns: NDArray[np.int64]
     rate: NDArray[np.float64]
-    """(n, 3) rad/s, lidar axes."""
+    """Mean angular rate of each interval, (n, 3) rad/s, lidar axes."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How the gyroscope's turns relate to the scans'."""
+    """Comparison of the gyroscope's rotations with the scans'."""
 
     turns: int
-    """Intervals compared."""
+    """Number of intervals compared."""
     rates: NDArray[np.float64]
-    """(3,) rms rate about the principal directions of the scans' turns, rad/s, largest first."""
+    """Rms rate about the principal directions of the scans' rotations, (3,) rad/s, largest first."""
     scale: float
-    """The gyroscope's rates over the scans'."""
+    """Ratio of the gyroscope's rates to the scans' rates."""
     correlation: float
-    """From 0 to 1, whatever the rotation between the axes, at the best clock offset."""
+    """Correlation of the rates at the best clock offset, 0 to 1, under the best rotation between the axes."""
     time_offset: float
-    """A scan stamped t was taken at IMU time t + time_offset, s; 0 where it cannot be told."""
+    """A scan stamped t was taken at IMU time t + time_offset, s; 0 where it is not observable."""
     time_offset_sigma: float | None
-    """s; None where it cannot be told."""
+    """Standard deviation of ``time_offset``, s; None where it is not observable."""
     R_imu_lidar: NDArray[np.float64] | None
-    """(3, 3); None where the turns are about one direction only."""
+    """Rotation from lidar axes to IMU axes, (3, 3); None where all rotations are about one direction."""
     rotation_sigma_deg: float | None
     off_deg: float | None
-    """Between the rotation that was assumed and the turns: all of it, or that of the one direction."""
+    """Angle between assumed and observed rotation, deg; of the axis alone if ``R_imu_lidar`` is None."""
     mirrored: bool
-    """One axis or all have the opposite sign: no rotation explains the turns."""
+    """Whether one axis or all have the opposite sign, so that no rotation explains the rates."""
 
 
 def lidar_turns(windows: list[list[LidarScan]], settings: Settings) -> Turns:
-    """Return the turns between the scans of each window by LiDAR odometry.
+    """Return the rotations between the scans of each window by LiDAR odometry.
 
     Args:
-        windows: consecutive scans each.
-        settings: recipe and values; of the axes only the lidar's are used.
+        windows: consecutive scans in each window.
+        settings: recipe and values; only the lidar's axes are used.
     """
     settings = settings.with_value("config.imu.use", False, "inspection")
     settings = settings.with_value("config.lidar.buckets", [THINNED_TO], "inspection")
@@ -79,7 +79,7 @@ def lidar_turns(windows: list[list[LidarScan]], settings: Settings) -> Turns:
             (_middle_ns(scan), _attitude(tracked), bool(tracked.failure))
             for scan, tracked in zip(scans, track(settings, scans, None, step), strict=True)
         ]
-        # the first scan is compensated with a velocity that only the second one tells
+        # the velocity that compensates the first scan is known from the second one only
         for (start, before, lost), (end, after, also_lost) in pairwise(found[1:]):
             if lost or also_lost or end <= start:
                 continue
@@ -91,7 +91,7 @@ def lidar_turns(windows: list[list[LidarScan]], settings: Settings) -> Turns:
 
 
 def _middle_ns(scan: LidarScan) -> int:
-    """Return when the pose is that the match finds; the one at the scan's end is extrapolated from there."""
+    """Return the time of the match's pose; the pose at the scan's end is extrapolated from it."""
     return scan.stamp_ns + round(scan.duration / 2 * 1e9)
 
 
@@ -106,19 +106,19 @@ def agreement(
     gyro_bias: NDArray[np.float64] | None,
     R_assumed: NDArray[np.float64],
 ) -> Agreement | None:
-    """Compare the turns; None where there are too few, or none to speak of.
+    """Compare the rotations; return None where they are too few or too small.
 
     Args:
-        turns: of the lidar.
-        parts: inertial samples, consecutive each.
-        gyro_bias: (3,) rad/s at rest, None where unknown.
+        turns: rotations of the lidar.
+        parts: inertial samples, consecutive in each part.
+        gyro_bias: (3,) rad/s, measured at rest; None where unknown.
         R_assumed: (3, 3) R_imu_lidar that a run would use.
     """
     integrals = [_Integral(part, gyro_bias) for part in parts if len(part.stamp_ns) > 1]
     seen = [_gyro_rates(turns, integrals, shift) for shift in _SHIFTS_S]
     common = np.all([np.isfinite(rates).all(axis=1) for rates in seen], axis=0)
     if np.count_nonzero(common) < _LEAST_TURNS:
-        # a recording too short to be shifted still tells of the axes
+        # a recording too short for a clock shift still shows the axes
         seen, common = [], np.isfinite(_gyro_rates(turns, integrals, 0.0)).all(axis=1)
     if np.count_nonzero(common) < _LEAST_TURNS:
         return None
@@ -156,12 +156,12 @@ def agreement(
 
 
 def in_degrees(found: Agreement) -> bool:
-    """Tell whether the gyroscope's rates are those of the scans in deg/s."""
+    """Return whether the gyroscope's rates are the scans' rates in deg/s."""
     return _DEGREES_RANGE[0] < found.scale < _DEGREES_RANGE[1]
 
 
 class _Integral:
-    """The angle that the gyroscope has turned by since a part's first sample."""
+    """Integral of the angular rate since a part's first sample."""
 
     def __init__(self, imu: ImuData, bias: NDArray[np.float64] | None) -> None:
         gyro = imu.gyro - (0.0 if bias is None else bias)
@@ -171,7 +171,7 @@ class _Integral:
         self.angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
     def at(self, stamp_ns: NDArray[np.int64], shift: float) -> NDArray[np.float64]:
-        """Return (n, 3) rad at times shifted by ``shift`` s; NaN beyond the part."""
+        """Return (n, 3) rad at the stamps shifted by ``shift`` s; NaN outside the part."""
         seconds = (stamp_ns - self.origin) * 1e-9 + shift
         columns = [np.interp(seconds, self.seconds, column, np.nan, np.nan) for column in self.angle.T]
         return np.stack(columns, axis=1)
@@ -189,7 +189,7 @@ def _gyro_rates(turns: Turns, integrals: list[_Integral], shift: float) -> NDArr
 def _clock(
     turns: Turns, integrals: list[_Integral], seen: list[NDArray[np.float64]], common: NDArray[np.bool_]
 ) -> tuple[float, float | None]:
-    """Return the shift at which the records fit best, and its sigma; None where that is not told."""
+    """Return the shift (s) at which the records fit best, and its sigma (s); None where not observable."""
     if not seen:
         return 0.0, None
     a = turns.rate[common] - turns.rate[common].mean(axis=0)
@@ -215,18 +215,18 @@ def _fit(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 def _wahba(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
-    """Return R with b = R a, and whether only a reflection fits (all three directions being observed)."""
+    """Return R with b = R a, and whether only a reflection fits (if all three directions are observable)."""
     u, values, vt = np.linalg.svd(b.T @ a)
     sign = float(np.sign(np.linalg.det(u @ vt)))
     rotation = u @ np.diag([1.0, 1.0, sign]) @ vt
-    # what the third direction adds to the misfit, against what is left of it at best
+    # the misfit that the third direction adds, compared with the smallest that remains of it
     best = np.sum(b**2) + np.sum(a**2) - 2 * values.sum()
     mirrored = sign < 0 and 4 * values[2] > 3 * max(best, 1e-12) and values[2] > 0.05 * values[0]
     return rotation, bool(mirrored)
 
 
 def _axis_apart(a: NDArray[np.float64], b: NDArray[np.float64], R_assumed: NDArray[np.float64]) -> float:
-    """Return the angle in deg between the assumed and the seen direction of turns about one direction."""
+    """Return the angle (deg) between the assumed and the observed axis, for rotations about one direction."""
     _, _, directions = np.linalg.svd(a, full_matrices=False)
     axis = directions[0]
     seen = b.T @ (a @ axis)

@@ -1,4 +1,4 @@
-"""What each recipe wants of a recording, and what is not there."""
+"""What each recipe needs from a recording, and what the recording lacks."""
 
 from lio_jax.inspection.inertial import InertialSummary
 from lio_jax.inspection.scans import ScanSummary
@@ -8,7 +8,7 @@ _FEW_RINGS = 4
 
 
 def missing(scans: ScanSummary, imu: InertialSummary | None, calibrated: bool) -> dict[str, list[str]]:
-    """Return, for each recipe, a sentence for each thing that it does not find."""
+    """Return, for each recipe, one sentence for each thing that the recording lacks."""
     times = not scans.time_spreads or max(scans.time_spreads) == 0.0
     without_times = (
         ["point times: the motion within a sweep is not compensated"] if times and scans.sweep else []

@@ -1,4 +1,4 @@
-"""Which parts of a recording are looked at: all of a short one, windows of consecutive scans of others."""
+"""Choose the parts of a recording to examine: all of a short one, windows of consecutive scans of others."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,42 +11,42 @@ from lio_jax.data.sequence import ImuData, LidarScan, Sequence
 
 WINDOW_SCANS = 12
 _ALL_SCANS = 40
-"""Recordings of no more scans are looked at as a whole."""
+"""Recordings with at most this number of scans are examined as a whole."""
 _WINDOWS = 4
 _LARGE_BYTES = 1_000_000_000
-"""Of a larger bag not even the inertial samples are all read."""
+"""Bags larger than this are read in parts only, inertial samples included, bytes."""
 _PART_S = 2.0
-"""Length of the parts that are read of a large bag."""
+"""Length of the parts that are read of a large bag, s."""
 _CANDIDATES = 40
 
 
 @dataclass(frozen=True)
 class Window:
-    """Consecutive scans."""
+    """A window of consecutive scans."""
 
     first: int
-    """Number of the first scan; counted from the window's start where ``numbered`` is false."""
+    """Number of the first scan; counted from the window's start if ``numbered`` is false."""
     numbered: bool
     scans: list[LidarScan]
 
 
 @dataclass(frozen=True)
 class Sampled:
-    """What is looked at of a recording."""
+    """The parts of a recording that are examined."""
 
     sequence: Sequence
     imu_parts: list[ImuData]
-    """One where all samples were read."""
+    """Inertial samples of each part; a single part if all samples were read."""
     whole: bool
-    """All inertial samples were read."""
+    """Whether all inertial samples were read."""
     said: str
-    """What was left out, "" where nothing was."""
+    """Sentence on the parts that were left out; "" if none was."""
     _places: list[tuple[int, int]]
-    """Of the windows: received from and to in ns for a bag, else first scan and number of scans."""
+    """First and last time of receipt (ns) of each window in a bag; else first scan and number of scans."""
     _parts: list[RosbagSequence]
 
     def windows(self) -> Iterator[Window]:
-        """Yield the windows, decoded one after another."""
+        """Yield the windows; each one is decoded when it is asked for."""
         for part in self._parts:
             yield Window(0, False, _first(part, WINDOW_SCANS))
         for first, count in self._places:
@@ -54,7 +54,7 @@ class Sampled:
 
 
 def sampled(sequence: Sequence) -> Sampled:
-    """Choose what to look at: where the gyroscope is busiest, and the recording's two ends."""
+    """Choose windows at the recording's two ends and where the angular rate is largest."""
     count = sequence.info.scan_count
     if isinstance(sequence, RosbagSequence):
         return _sampled_bag(sequence, count)
@@ -94,12 +94,12 @@ def _parts(bag: RosbagSequence, shares: list[float], length_s: float) -> list[Ro
 
 
 def _window_s(length_ns: int, count: int) -> float:
-    """Return a time in which a window's scans arrive, s."""
+    """Return a time within which all scans of a window arrive, s."""
     return (WINDOW_SCANS + 2) * length_ns * 1e-9 / max(count, 1)
 
 
 def _shares(imu: ImuData | None) -> list[float]:
-    """Return where windows start, from 0 to 1: both ends, and where the angular rate is largest between."""
+    """Return where windows start, 0 to 1: at both ends, and where the angular rate is largest in between."""
     even = np.linspace(0.0, 1.0, _WINDOWS).tolist()
     if imu is None or len(imu.gyro) < 10 * _CANDIDATES:
         return even

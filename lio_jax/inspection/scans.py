@@ -1,4 +1,4 @@
-"""What the sampled scans are like: points, ranges, rings, times, and the rhythm they come in."""
+"""Properties of the sampled scans: points, ranges, rings, times, and the time between scans."""
 
 import math
 from dataclasses import dataclass, field
@@ -12,13 +12,13 @@ from lio_jax.inspection.sampling import Window
 
 FEW_POINTS = 1000
 GAP_FACTOR = 1.8
-"""A step between stamps longer than this many median ones is a gap: a scan is missing."""
+"""A step between stamps that is longer than this many median steps is a gap: a scan is missing."""
 RANGE_EDGES_M = (0.0, 0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, math.inf)
 
 
 @dataclass
 class ScanSummary:
-    """The few numbers kept of each sampled scan, so that no scan stays in memory."""
+    """A few numbers of each sampled scan, so that no scan stays in memory."""
 
     starts_ns: list[int] = field(default_factory=list)
     ends_ns: list[int] = field(default_factory=list)
@@ -27,16 +27,16 @@ class ScanSummary:
     dropped: list[int] = field(default_factory=list)
     durations: list[float] = field(default_factory=list)
     steps_ns: list[int] = field(default_factory=list)
-    """Between the starts of consecutive scans."""
+    """Time between the starts of consecutive scans, ns."""
     time_spreads: list[float] = field(default_factory=list)
     time_values: list[int] = field(default_factory=list)
     ranges: list[tuple[float, float]] = field(default_factory=list)
     histogram: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(RANGE_EDGES_M) - 1, np.int64))
-    """Points by range."""
+    """Number of points in each interval of range."""
     rings: set[int] = field(default_factory=set)
 
     def add(self, window: Window) -> None:
-        """Add consecutive scans."""
+        """Add the consecutive scans of a window."""
         stamps = [scan.stamp_ns for scan in window.scans]
         self.steps_ns += np.diff(stamps).tolist()
         for place, scan in enumerate(window.scans):
@@ -62,13 +62,13 @@ class ScanSummary:
 
     @property
     def rate(self) -> float | None:
-        """Scans a second by the median step, Hz."""
+        """Rate of the scans by the median step, Hz."""
         forward = [step for step in self.steps_ns if step > 0]
         return 1e9 / float(np.median(forward)) if forward else None
 
     @property
     def jitter(self) -> float | None:
-        """Typical deviation of a step from the median one, s: 1.48 median absolute deviations."""
+        """Typical deviation of a step from the median step, s: 1.48 median absolute deviations."""
         if len(self.steps_ns) < 2:
             return None
         steps = np.array(self.steps_ns) * 1e-9
@@ -76,7 +76,7 @@ class ScanSummary:
 
     @property
     def gaps(self) -> list[float]:
-        """Steps that are too long, s."""
+        """Steps that are longer than ``GAP_FACTOR`` median steps, s."""
         if not self.steps_ns:
             return []
         median = float(np.median(self.steps_ns))
@@ -89,13 +89,13 @@ class ScanSummary:
 
     @property
     def dropped_share(self) -> float | None:
-        """Share of the recorded points that are no returns: NaN, infinite or zero."""
+        """Share of the recorded points without a return: NaN, infinite or zero."""
         recorded = sum(self.counts) + sum(self.dropped)
         return sum(self.dropped) / recorded if recorded else None
 
     @property
     def range_shares(self) -> dict[str, float]:
-        """Share of the points by range, such as "2 to 5 m"."""
+        """Share of the points in each interval of range, for example "2 to 5 m"."""
         total = int(self.histogram.sum())
         names = [
             f"{low:g} to {high:g} m" if math.isfinite(high) else f"over {low:g} m"
@@ -109,14 +109,14 @@ class ScanSummary:
 
     @property
     def spread(self) -> dict[str, float]:
-        """Least, median and greatest number of points of a scan."""
+        """Smallest, median and largest number of points of a scan."""
         if not self.counts:
             return {"min": 0, "median": 0.0, "max": 0}
         return {"min": min(self.counts), "median": float(np.median(self.counts)), "max": max(self.counts)}
 
     @property
     def point_time(self) -> str:
-        """How the times of the points in a scan are spread."""
+        """Sentence on how the times of the points are distributed in a scan."""
         if not self.time_spreads:
             return "none"
         spread = float(np.median(self.time_spreads))
@@ -126,7 +126,7 @@ class ScanSummary:
         return f"{values} different times over {spread * 1e3:.1f} ms"
 
     def problems(self, count: int) -> list[str]:
-        """Return a sentence for each thing that is wrong; ``count``: scans of the recording."""
+        """Return one sentence for each fault; ``count`` is the recording's number of scans."""
         said = []
         if not self.counts:
             said.append(f"none of the {count} scan(s) could be decoded.")
@@ -144,7 +144,7 @@ class ScanSummary:
                 f"{max(self.gaps):.3f} s: scans are missing there."
             )
         if len(self.rings) == 1:
-            said.append("all points carry the same ring: scan lines cannot be told apart.")
+            said.append("all points carry the same ring: scan lines cannot be separated.")
         if self.sweep and self.time_spreads and float(np.median(self.time_spreads)) == 0.0:
             said.append(
                 f"all points of a scan carry one time although a sweep takes {self.sweep:.3f} s: its motion "

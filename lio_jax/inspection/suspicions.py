@@ -1,4 +1,4 @@
-"""What the turns of scans and gyroscope give away, in words with a remedy."""
+"""Faults that the rotations of scans and gyroscope indicate, as sentences with a remedy."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,19 +13,19 @@ _NOT_CERTAIN_DEG = 4.0
 _LARGEST_OFFSET_S = 0.02
 _SIGMAS = 4.0
 _OTHER_END = 0.2
-"""Share of a sweep by which an offset may differ from one and still be the stamp's other end."""
+"""An offset that differs from a sweep by less than this share of it points to the stamp's other end."""
 
 
 def suspicions(
     found: Agreement, sweep: float | None, calibrated: bool, rate: float | None
 ) -> tuple[list[str], list[Suggestion]]:
-    """Return a sentence for each thing that is suspected, and the settings that would put it right.
+    """Return one sentence for each suspected fault, and the settings that would correct it.
 
     Args:
-        found: the comparison.
+        found: result of the comparison.
         sweep: duration of a scan, s.
-        calibrated: whether the axes that were assumed are from a calibration.
-        rate: of the inertial samples, Hz.
+        calibrated: whether the assumed axes come from a calibration.
+        rate: rate of the inertial samples, Hz.
     """
     if in_degrees(found):
         sentence = (
@@ -35,7 +35,7 @@ def suspicions(
         return [sentence], []
     if found.correlation < _LEAST_CORRELATION:
         sentence = (
-            f"scans and gyroscope do not tell of the same turns (correlation {found.correlation:.2f}): their "
+            f"scans and gyroscope show different rotations (correlation {found.correlation:.2f}): their "
             "clocks, units or axes differ, or the scans cannot be matched."
         )
         return [sentence], []
@@ -83,7 +83,7 @@ def _rotation(found: Agreement, calibrated: bool) -> tuple[list[str], list[Sugge
 
 def _clock(found: Agreement, sweep: float | None, rate: float | None) -> tuple[list[str], list[Suggestion]]:
     sigma = found.time_offset_sigma
-    # a slow IMU's own interval hides what is shorter
+    # an offset shorter than the interval of a slow IMU is not observable
     least = max(_LARGEST_OFFSET_S, 0.5 / rate if rate else 0.0)
     if sigma is None or abs(found.time_offset) < max(least, _SIGMAS * sigma):
         return [], []
@@ -101,6 +101,6 @@ def _clock(found: Agreement, sweep: float | None, rate: float | None) -> tuple[l
 
 
 def _quarter_turns(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation by quarter turns about the axes that is nearest."""
+    """Return the nearest rotation by quarter turns about the axes."""
     turns = Rotation.create_group("O").as_matrix()
     return turns[int(np.argmax(np.einsum("kij,ij->k", turns, R)))]

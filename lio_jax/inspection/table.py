@@ -1,10 +1,10 @@
-"""Write an inspection for people to read."""
+"""Format an inspection as text."""
 
 from lio_jax.inspection.findings import Inspection
 
 
 def format_inspection(inspection: Inspection) -> str:
-    """Return a two-column table followed by topics, notes, problems and the options that fit."""
+    """Return a two-column table, followed by topics, notes, problems and the options that fit."""
     rows = _rows(inspection)
     width = max(len(label) for label, _ in rows)
     lines = [f"{label:<{width}}  {value}" for label, value in rows]

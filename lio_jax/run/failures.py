@@ -1,4 +1,4 @@
-"""What went wrong with a scan, in one sentence, and which directions it leaves unobserved."""
+"""Describe what went wrong with a scan in one sentence, and which directions are not observable from it."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,19 +14,20 @@ from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT
 from lio_jax.settings.settings import Settings
 
 _NAMED = 0.8
-"""Share of an axis that must lie in the unobserved directions to name them after it."""
+"""Share of an axis that must be in the unobserved space for its name to be used."""
 _MOVING = 0.5
-"""Slower than this the direction of motion is not known, m/s."""
+"""Speed below which the direction of motion is not known, m/s."""
 
 
 def unobserved_directions(registration: Any, nav: Any) -> list[str]:
-    """Return words for the degenerate directions of a scan match, as many as there are.
+    """Return words for the degenerate directions of a scan match, one for each.
 
-    Horizontal ones are told from the direction of motion, at rest from the IMU's x axis; the vertical is the
-    world's z. A direction beside these axes is given by its components.
+    Horizontal directions are named relative to the direction of motion, at rest relative to the IMU's x axis;
+    the vertical is the world's z. A direction near none of these axes is given by its components.
 
     Args:
-        registration: a scan match whose degenerate directions hold no information, or the least.
+        registration: scan match with its degenerate directions, about which it holds no or little
+            information.
         nav: navigation state at the scan's end.
     """
     weak = weak_directions(registration)
@@ -48,9 +49,9 @@ def unobserved_directions(registration: Any, nav: Any) -> list[str]:
 
 
 def weak_directions(registration: Any) -> NDArray[np.float64]:
-    """Return the (6, k) directions a scan match does not observe, rotation before translation, in world axes.
+    """Return the (6, k) directions that a scan match does not observe, rotation first, world axes.
 
-    Rotations are scaled to metres of a typical point, so that the six compare.
+    Rotations are scaled to metres at a typical point, so that all six directions are comparable.
     """
     missing = int(np.sum(registration.degenerate))
     R_world_lidar = Rotation.from_quat(
@@ -65,7 +66,7 @@ def weak_directions(registration: Any) -> NDArray[np.float64]:
 
 
 def _heading(nav: Any) -> tuple[NDArray[np.float64], str]:
-    """Return a horizontal unit vector in world, and what it is."""
+    """Return a horizontal unit vector, (3,), world frame, and its name."""
     wxyz = np.asarray(nav.T_world_imu.wxyz_xyz, np.float64)[:4]
     moving = np.asarray(nav.velocity, np.float64) * [1, 1, 0]
     x_axis = Rotation.from_quat(wxyz, scalar_first=True).as_matrix()[:, 0] * [1, 1, 0]
@@ -76,7 +77,7 @@ def _heading(nav: Any) -> tuple[NDArray[np.float64], str]:
 
 
 def _without(weak: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the basis (6, k) of what is left of a space once its part along ``direction`` is named."""
+    """Return the basis (6, k) of the rest of a space after its part along ``direction`` is removed."""
     along = weak.T @ direction
     along /= np.linalg.norm(along)
     rest, _, _ = np.linalg.svd(np.eye(len(along)) - np.outer(along, along))
@@ -86,34 +87,34 @@ def _without(weak: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArr
 def _components(vector: NDArray[np.float64]) -> str:
     turn, move = vector[:3], vector[3:]
     kind, part = ("along", move) if np.linalg.norm(move) > np.linalg.norm(turn) else ("turning about", turn)
-    # either sign means the same; adding zero turns a rounded -0.0 into 0.0
+    # both signs mean the same direction; the addition of zero turns a rounded -0.0 into 0.0
     unit = part / np.linalg.norm(part) * np.sign(part[np.argmax(np.abs(part))])
     x, y, z = np.round(unit, 2) + 0.0
     return f"{kind} ({x:.2f}, {y:.2f}, {z:.2f}) in world"
 
 
 _UNLIKELY_NIS = 22.46
-"""A consistent filter exceeds this once in a thousand scans: chi-square of the six directions of a pose."""
+"""Bound that a consistent filter exceeds once in 1000 scans: chi-square with six degrees of freedom."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known about one scan's estimate, on the host."""
+    """The results for one scan from which failures are found, on the host."""
 
     points: int
-    """Of the scan as it was recorded."""
+    """Number of points of the scan as it was recorded."""
     nav: Any
     """Navigation state, numpy leaves."""
     registration: Any
     """The scan match, numpy leaves."""
     lost: bool
-    """The pose is the prediction."""
+    """Whether the pose is the prediction."""
     nis: float
-    """Normalised innovation squared of the match; 0 where there was none."""
+    """Normalised innovation squared of the match; 0 without a match."""
     since_last_s: float
-    """From the last scan's end to this one's, s; 0 for the first."""
+    """Time from the last scan's end to this scan's end, s; 0 for the first scan."""
     imu_gap_s: float | None
-    """Longest time without an inertial sample since then, s; None where none are used."""
+    """Longest time without an inertial sample since the last scan's end, s; None if no samples are used."""
     restarted: bool = False
     """The smoother ran away and began anew."""
     smoother_unfinished: bool = False
@@ -121,22 +122,22 @@ class Evidence:
 
 
 def failure_of(now: Evidence, before: Evidence | None, settings: Settings) -> str:
-    """Return what went wrong with a scan, one sentence for each thing, or nothing.
+    """Return one sentence for each thing that went wrong with a scan, or "".
 
-    Speed and biases beyond ``params.limits`` are reported once, when they get there (LIO-SAM's
-    failureDetection), with what most likely caused it.
+    A speed or a bias beyond ``params.limits`` is reported once, when it passes the limit (LIO-SAM's
+    failureDetection), with the most likely cause.
 
     Args:
-        now: the scan.
-        before: the one before, if any.
-        settings: of the run.
+        now: evidence of the scan.
+        before: evidence of the scan before, if any.
+        settings: settings of the run.
     """
     limits = settings.values["limits"]
     said = [_match_failure(now, settings)]
     if now.restarted:
         said.append(
             "the smoother's velocity or biases ran beyond params.limits or were not finite; "
-            f"it began anew at rest: {_cause(now)}."
+            f"it started again at rest: {_cause(now)}."
         )
     if now.since_last_s > limits["outage"]:
         by = "constant velocity" if _gap(now) > LONGEST_GAP or now.imu_gap_s is None else "inertial samples"
@@ -152,12 +153,12 @@ def failure_of(now: Evidence, before: Evidence | None, settings: Settings) -> st
 
 
 def longest_gap(samples: ImuBatch, start: float, end: float) -> float:
-    """Return the longest time without a sample that touches a span, s.
+    """Return the longest time without a sample that overlaps an interval, s.
 
     Args:
-        samples: of the span and its neighbours, numpy leaves.
-        start: s, by the samples' clock.
-        end: s, likewise.
+        samples: samples in the interval and their neighbours, numpy leaves.
+        start: start of the interval, s, on the samples' clock.
+        end: end of the interval, s, on the samples' clock.
     """
     times = np.asarray(samples.time)[np.asarray(samples.mask)]
     if not len(times):
@@ -174,7 +175,7 @@ def _match_failure(now: Evidence, settings: Settings) -> str:
     if found.status == NOT_FINITE:
         return (
             f"the update was not finite ({_not_finite(found)}); state and covariance are the prediction's, "
-            "the map was left alone."
+            "the map was not changed."
         )
     if now.lost:
         needed = settings.values["registration"]["min_matches"]
@@ -189,7 +190,7 @@ def _match_failure(now: Evidence, settings: Settings) -> str:
         if now.smoother_unfinished:
             return "the smoother did not converge within its iterations; its last states were kept."
         return f"registration did not converge in {limit} iterations; its last pose was kept."
-    # too few matches without being lost: the scan that starts the map
+    # too few matches but not lost: the scan that starts the map
     if found.status == CONVERGED and (weak := int(found.degenerate.sum())):
         words = ", ".join(unobserved_directions(found, now.nav))
         return f"the scene leaves {weak} of 6 directions unobserved ({words}); there the prediction was kept."
@@ -206,7 +207,7 @@ def _not_finite(found: Any) -> str:
 def _limited(
     now: Evidence, before: Evidence | None, limits: dict[str, Any]
 ) -> list[tuple[tuple[str, str], float, float, str]]:
-    """Return what is limited: its words, now, before, and the limit's name."""
+    """Return for each exceeded limit: its words, the value now, the value before, and the limit's name."""
     watched = (
         (("the speed reached", "m/s"), "velocity", "speed"),
         (("the gyroscope's bias reached", "rad/s"), "gyro_bias", "gyro_bias"),
@@ -221,7 +222,7 @@ def _limited(
 
 
 def _cause(now: Evidence) -> str:
-    """Return what most likely drove the estimate there."""
+    """Return the most likely cause of the estimate's deviation."""
     suspects = _suspects(now) + ["the scan was not matched"] * now.lost
     if suspects:
         return f"likely because {' and '.join(suspects)}"

@@ -1,4 +1,4 @@
-"""Settings that follow from a recording's first scans: voxel sizes and the sensor's rings and columns."""
+"""Settings that follow from a recording's first scans: voxel sizes, and the sensor's rings and columns."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -14,18 +14,21 @@ from lio_jax.recipes import recipe_named
 from lio_jax.settings.settings import Settings
 
 _NEAR_M, _SHARE = 10.0, 90
-"""Range within which that percentage of the points lies where the surroundings are near: rooms, corridors and
-stairs. On open ground the many returns next to a low sensor do not reach it."""
+"""Surroundings are near if this percentage of the points is within this range, m.
+
+That holds in rooms, corridors and stairs. On open ground the many returns next to a low sensor are not
+enough.
+"""
 _LOOKED_AT = 3
-"""Scans of which the first with points decides."""
+"""Number of first scans; the first of them that has points decides."""
 _OWN_BODY_M = 0.3
 """Nearer returns are of whoever carries the sensor."""
 
 
 def fitted_to_surroundings(sequence: Sequence, settings: Settings) -> tuple[Settings, list[str]]:
-    """Return settings with finer voxels where the surroundings are near, unless they were given; say so.
+    """Return settings with finer voxels if the surroundings are near, and a note on the change.
 
-    Voxels and spacings go together: where one of them was given, none is changed.
+    Voxels and spacings are changed together: if the user sets one of them, none is changed.
     """
     near = recipe_named(settings.recipe).near_values
     together = {path for path in near if path != "params.lidar.min_range"}
@@ -45,7 +48,7 @@ def fitted_to_surroundings(sequence: Sequence, settings: Settings) -> tuple[Sett
 
 
 def _reach(sequence: Sequence) -> float | None:
-    """Return the range within which most points of the first scan that has any lie, m."""
+    """Return the range that contains most points of the first scan with points, m."""
     for scan in sequence.scans(0, _LOOKED_AT):
         ranges = np.linalg.norm(scan.points, axis=1)
         ranges = ranges[np.isfinite(ranges) & (ranges > _OWN_BODY_M)]
@@ -55,20 +58,20 @@ def _reach(sequence: Sequence) -> float | None:
 
 
 _SCANS_WITH_RINGS = 10
-"""Scans: in an open place a single one may not show the upper beams, and the very first may be cut short."""
+"""Number of first scans: a single scan may miss the upper beams, and the first one may be incomplete."""
 _SLACK = 1.125
-"""Room for scans with longer rings than theirs."""
+"""Factor for scans whose rings are longer than those of the first scans."""
 _SURFACE_SHARE = 0.625
-"""Of a scan's points; beyond it surface points are thinned evenly."""
+"""Share of a scan's points; surface points beyond it are thinned evenly."""
 _MOST_SURFACE_POINTS = 49152
 
 
 def with_sensor_sizes(settings: Settings, scans: Iterable[LidarScan]) -> tuple[Settings, list[str]]:
-    """Return settings in which no size of ``config.features`` is 0, and a sentence on what was chosen.
+    """Return settings without a size of 0 in ``config.features``, and a sentence on the chosen sizes.
 
     Args:
-        settings: of a run.
-        scans: of the recording; the first ones decide, by the largest.
+        settings: settings of a run.
+        scans: scans of the recording; the largest of the first ones decides.
     """
     features = getattr(settings.config, "features", None)
     if not isinstance(features, RingConfig):

@@ -1,4 +1,4 @@
-"""What a run ran on, for whoever compares its times or repeats it."""
+"""A run's folder: its files, how it is held and written, and the environment that it records."""
 
 import json
 import os
@@ -20,7 +20,7 @@ _LIBRARIES = ("lio-jax", "jax", "jaxlib", "numpy", "scipy")
 
 
 def environment() -> dict[str, str]:
-    """Return versions, processor and devices by name."""
+    """Return versions, processor and devices by name, for comparisons of times and for repetitions."""
     devices = sorted({f"{device.platform}: {device.device_kind}" for device in jax.devices()})
     return {
         **{name: _version(name) for name in _LIBRARIES},
@@ -41,7 +41,7 @@ def _version(name: str) -> str:
 
 
 def usable_cores() -> int:
-    """Return how many cores the process may use."""
+    """Return the number of cores that the process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -74,20 +74,20 @@ RUN_FILES = (
     "timings.png",
     "report.html",
 )
-"""What a run may write, beside its keyframes."""
+"""Files that a run may write, besides its keyframes."""
 
 _SPOOL = f"map{SPOOL_SUFFIX}"
 
 
 @contextmanager
 def run_folder(path: Path, overwrite: bool) -> Iterator[None]:
-    """Hold an empty run folder during the block; one made for it that stays empty is removed again.
+    """Hold an empty run folder during the block; a folder made for it that stays empty is removed again.
 
-    With ``overwrite`` the files of an earlier run are removed and nothing else. The hidden files of a killed
-    run are removed in any case, and do not count.
+    With ``overwrite`` the files of an earlier run are removed, and nothing else. The hidden files of a killed
+    run are removed in every case.
 
     Raises:
-        UsageError: something is there already and ``overwrite`` is not set, another run is writing there, or
+        UsageError: the folder is not empty and ``overwrite`` is not set, another run is writing there, or
             the folder cannot be made.
     """
     if path.is_file():
@@ -105,7 +105,7 @@ def run_folder(path: Path, overwrite: bool) -> Iterator[None]:
             yield
     finally:
         if made:
-            with suppress(OSError):  # it holds results
+            with suppress(OSError):  # the folder holds results
                 path.rmdir()
 
 
@@ -121,11 +121,11 @@ def _make_empty(path: Path, overwrite: bool) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all."""
+    """Write a text file, complete or not at all."""
     with atomic_path(path) as aside:
         aside.write_text(text)
 
 
 def write_json(path: Path, values: dict[str, Any]) -> None:
-    """Write JSON (no NaN, no infinity) whole or not at all."""
+    """Write JSON without NaN and infinity, complete or not at all."""
     write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")

@@ -20,11 +20,11 @@ from lio_jax.run.track import ScanResult
 from lio_jax.settings.settings import Settings
 
 _LOOSE = np.diag([1e-2] * 3 + [1.0] * 3)
-"""Covariance where nothing is known: sigmas of 0.1 rad and 1 m."""
+"""Covariance where it is unknown: standard deviations of 0.1 rad and 1 m."""
 
 
 class KeyframePicker:
-    """Makes keyframes of those scans that moved or turned enough since the last one."""
+    """Choose as keyframes the scans that moved or turned enough since the last keyframe."""
 
     def __init__(self, settings: Settings) -> None:
         sigmas, output = settings.values["backend"], settings.run.output
@@ -34,13 +34,13 @@ class KeyframePicker:
         self._last: Keyframe | None = None
         self._failed = False
         self.stamps_ns: list[int] = []
-        """Of the keyframes so far."""
+        """Stamps of the keyframes so far, ns."""
 
     def __call__(self, tracked: ScanResult) -> Keyframe | None:
-        """Return the scan as a keyframe, or None where it is none.
+        """Return the scan as a keyframe, or None if it is not one.
 
-        What lies between two keyframes is as sure as ``params.backend`` says; it is hardly known where a scan
-        between them failed.
+        The covariance between two keyframes is that of ``params.backend``; it is large if a scan between them
+        failed.
         """
         T = tracked.T_world_imu
         self._failed |= bool(tracked.failure)
@@ -61,9 +61,9 @@ class KeyframePicker:
 
 
 def points_in_imu(tracked: ScanResult) -> NDArray[np.float32]:
-    """Return the scan's (n, 3) compensated points, m, in the IMU frame at its end."""
+    """Return the scan's compensated points, (n, 3) m, in the IMU frame at the scan's end."""
     output, T = tracked.output, tracked.T_world_imu
-    # small numbers first: points count from a near origin
+    # the difference of the origins is taken in double precision; the points count from a near origin
     from_imu = np.asarray(output.points)[np.asarray(output.points_mask)] + (
         np.asarray(output.origin) - T[:3, 3]
     ).astype(np.float32)
@@ -71,25 +71,25 @@ def points_in_imu(tracked: ScanResult) -> NDArray[np.float32]:
 
 
 def corner_marks(tracked: ScanResult) -> NDArray[np.bool_] | None:
-    """Return which of :func:`points_in_imu` are corners, (n,); None where the recipe does not tell."""
+    """Return which of :func:`points_in_imu` are corners, (n,); None where the recipe does not separate."""
     output = tracked.output
     return None if output.corners is None else np.asarray(output.corners)[np.asarray(output.points_mask)]
 
 
 def is_keyframe(T_last: NDArray[np.float64], T: NDArray[np.float64], distance: float, angle: float) -> bool:
-    """Tell whether a (4, 4) pose is further than ``distance`` (m) or ``angle`` (rad) from the last one."""
+    """Return whether a (4, 4) pose is further than ``distance`` (m) or ``angle`` (rad) from the last one."""
     moved = np.linalg.inv(T_last) @ T
     turned = np.arccos(np.clip((np.trace(moved[:3, :3]) - 1) / 2, -1.0, 1.0))
     return bool(np.linalg.norm(moved[:3, 3]) > distance or turned > angle)
 
 
 def keyframe_indices(poses: NDArray[np.float64], distance: float, angle: float) -> list[int]:
-    """Return the poses that moved or turned enough since the last one returned, the first included.
+    """Return the indices of poses that moved or turned enough since the last chosen one; the first is chosen.
 
     Args:
-        poses: (n, 4, 4).
-        distance: m.
-        angle: rad.
+        poses: (n, 4, 4) poses, m.
+        distance: least distance between keyframes, m.
+        angle: least angle between keyframes, rad.
     """
     chosen = [0]
     for index in range(1, len(poses)):
@@ -99,14 +99,15 @@ def keyframe_indices(poses: NDArray[np.float64], distance: float, angle: float) 
 
 
 def odometry_edges(poses: NDArray[np.float64], covariances: NDArray[np.float64]) -> list[Edge]:
-    """Return the edges between consecutive poses, their errors taken as independent.
+    """Return the edges between consecutive poses, under the assumption of independent errors.
 
-    A relative pose T_i_j = T_i^-1 T_j has covariance S_j + A S_i A', with A the adjoint of T_j_i. Where a
-    covariance is unknown the edge gets a sigma of 0.1 rad and 1 m.
+    A relative pose T_i_j = T_i^-1 T_j has the covariance S_j + A S_i A', with A the adjoint of T_j_i. Where a
+    covariance is unknown, the edge gets standard deviations of 0.1 rad and 1 m.
 
     Args:
-        poses: (n, 4, 4).
-        covariances: (n, 6, 6) of each pose's right perturbation, rotation first; NaN where unknown.
+        poses: (n, 4, 4) poses, m.
+        covariances: (n, 6, 6) covariances of the poses' right perturbations, rotation first; NaN where
+            unknown.
     """
     edges = []
     for i in range(len(poses) - 1):
@@ -126,7 +127,7 @@ _UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 
 
 class KeyframeWriter:
-    """Writes clouds while a run goes on, and where they belong at its end."""
+    """Write keyframes' clouds during a run, and the keyframes' poses at its end."""
 
     def __init__(self, run_folder: Path) -> None:
         self._folder = run_folder / FOLDER
@@ -138,7 +139,7 @@ class KeyframeWriter:
 
         Args:
             points: (n, 3) m, in the IMU frame at the keyframe's stamp.
-            corner: (n,) which of them are corners, where the recipe tells.
+            corner: (n,) which points are corners, where the recipe separates them.
         """
         arrays: dict[str, Any] = {"points": np.asarray(points, np.float32)}
         if corner is not None:
@@ -153,15 +154,15 @@ class KeyframeWriter:
         T_world_imu: NDArray[np.float64],
         T_odom_imu: NDArray[np.float64],
     ) -> None:
-        """Write the index; it may be written again with poses that are corrected further.
+        """Write the index; it may be written again after further corrections of the poses.
 
         Args:
-            stamps_ns: (k,) of all keyframes appended.
+            stamps_ns: (k,) stamps of all appended keyframes, ns.
             T_world_imu: (k, 4, 4) corrected poses.
             T_odom_imu: (k, 4, 4) poses of the smooth odometry.
 
         Raises:
-            ValueError: there are more poses than clouds, or fewer.
+            ValueError: the number of poses differs from the number of clouds.
         """
         shapes = (len(stamps_ns), np.shape(T_world_imu), np.shape(T_odom_imu))
         if shapes != (self._count, (self._count, 4, 4), (self._count, 4, 4)):
@@ -172,20 +173,20 @@ class KeyframeWriter:
 
 @dataclass(frozen=True, eq=False)
 class StoredKeyframes:
-    """The keyframes that a run left behind."""
+    """The keyframes that a run has written."""
 
     folder: Path
     stamps_ns: NDArray[np.int64]
     T_world_imu: NDArray[np.float64]
-    """(k, 4, 4) corrected poses."""
+    """Corrected poses, (k, 4, 4)."""
     T_odom_imu: NDArray[np.float64]
-    """(k, 4, 4) poses of the smooth odometry."""
+    """Poses of the smooth odometry, (k, 4, 4)."""
 
     def points(self, number: int, part: Part = "whole") -> NDArray[np.float32]:
-        """Return (n, 3) points of one keyframe, m, in its IMU frame.
+        """Return the points of one keyframe, (n, 3) m, in its IMU frame.
 
         Raises:
-            LioJaxError: the file is missing or damaged, or does not tell corners from surfaces.
+            LioJaxError: the file is missing or damaged, or does not separate corners from surfaces.
         """
         path = self.folder / _name(number)
         arrays = _arrays(path)
@@ -195,23 +196,23 @@ class StoredKeyframes:
         if part == "whole":
             return points.astype(np.float32, copy=False)
         if corner is None:
-            raise LioJaxError(f"{path}: the recipe told no corners from surfaces; take the part 'whole'.")
+            raise LioJaxError(f"{path}: the recipe separated no corners; take the part 'whole'.")
         if corner.shape != (len(points),):
             raise LioJaxError(f"{path}: {len(points)} points, but {len(corner)} marks of corners; run again.")
         return points[corner == (part == "corner")].astype(np.float32, copy=False)
 
     def clouds(self, part: Part = "whole") -> Iterator[tuple[NDArray[np.float64], NDArray[np.float32]]]:
-        """Yield T_world_imu (4, 4) and points (n, 3) of the keyframes whose pose is finite, one by one."""
+        """Yield T_world_imu (4, 4) and points (n, 3) of each keyframe whose pose is finite."""
         for number, T_world_imu in enumerate(self.T_world_imu):
             if np.isfinite(T_world_imu).all():
                 yield T_world_imu, self.points(number, part)
 
 
 def read_keyframes(run_folder: Path) -> StoredKeyframes:
-    """Open the keyframes of a run; their clouds are read one by one.
+    """Open the keyframes of a run; their clouds are read one by one when needed.
 
     Raises:
-        LioJaxError: there are none, or their index is missing or damaged.
+        LioJaxError: there are no keyframes, or their index is missing or damaged.
     """
     folder = run_folder / FOLDER
     if not folder.is_dir():
@@ -230,11 +231,11 @@ def read_keyframes(run_folder: Path) -> StoredKeyframes:
 
 
 def remove_keyframes(run_folder: Path, unfinished_only: bool = False) -> None:
-    """Remove the keyframes of an earlier run, those half written too, and nothing else.
+    """Remove the keyframes of an earlier run, half-written ones included, and nothing else.
 
     Args:
-        run_folder: of the run.
-        unfinished_only: keep those with an index: their run came to its end.
+        run_folder: folder of the run.
+        unfinished_only: keep keyframes with an index: their run was completed.
     """
     folder = run_folder / FOLDER
     if not folder.is_dir() or folder.is_symlink() or (unfinished_only and (folder / _INDEX).exists()):
@@ -242,7 +243,7 @@ def remove_keyframes(run_folder: Path, unfinished_only: bool = False) -> None:
     for entry in folder.iterdir():
         if _OURS.fullmatch(entry.name):
             entry.unlink()
-    with suppress(OSError):  # something of another's is in it
+    with suppress(OSError):  # the folder holds files of others
         folder.rmdir()
 
 

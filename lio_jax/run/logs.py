@@ -32,7 +32,7 @@ class TrajectoryLog(Sink):
         nav, state = result.nav, result.output.covariance
         match = _covariance(result) if self._rows else np.zeros((6, 6))
         self._matches.append(match)
-        # copies: a view would keep the device's memory around it
+        # copies: a view would keep the device's memory allocated
         whole = {} if state is None else {"state_covariance": np.array(state)}
         pose = whole["state_covariance"][:6, :6] if whole else match
         self._rows.append(
@@ -71,11 +71,11 @@ class TrajectoryLog(Sink):
         )
 
     def column(self, name: str) -> NDArray:
-        """Return one quantity of all scans, stacked."""
+        """Return one quantity of all scans, stacked along the first axis."""
         return np.stack([row[name] for row in self._rows])
 
     def match_covariances(self) -> NDArray[np.float64]:
-        """Return (n, 6, 6) covariances of the poses by the matches with the map alone."""
+        """Return the covariances (n, 6, 6) of the poses from the matches with the map alone."""
         return np.stack(self._matches)
 
     def trajectory(self) -> Trajectory:
@@ -83,11 +83,11 @@ class TrajectoryLog(Sink):
         return Trajectory(self.column("stamps_ns"), self.column("poses"))
 
     def lidar_poses(self) -> NDArray[np.float64]:
-        """Return (n, 4, 4) T_world_lidar at the scans' ends."""
+        """Return T_world_lidar at the scans' ends, (n, 4, 4)."""
         return self.column("poses") @ self.column("extrinsic")
 
     def write_npz(self, path: Path) -> None:
-        """Write every column, one row a scan, at the scans' ends.
+        """Write every column, with one row for each scan, at the scans' ends.
 
         - ``stamps_ns`` (n,) int64;
         - ``poses`` (n, 4, 4) T_world_imu;
@@ -96,11 +96,12 @@ class TrajectoryLog(Sink):
         - ``gravity`` (n, 3) in world, m/s^2;
         - ``extrinsic`` (n, 4, 4) T_imu_lidar;
         - ``time_offset`` (n,) s: a scan stamped t was taken at IMU time t + time_offset;
-        - ``covariance`` (n, 6, 6) of the pose's right perturbation (rotation rad, position m): the filter's,
-          which in the recipe default holds the drift of the map, too; in LiDAR odometry that of the match
-          with the map alone, NaN where unknown;
+        - ``covariance`` (n, 6, 6) of the pose's right perturbation (rotation rad, position m). Filters give
+          their own; in the recipe default it includes the drift of the map. LiDAR odometry gives that of the
+          match with the map alone; NaN where unknown;
         - ``state_covariance`` (n, 24, 24) of the whole error state, from filters only;
-        - ``nis``, ``nis_dof`` (n,) normalised innovation squared and its degrees of freedom, 0 without.
+        - ``nis``, ``nis_dof`` (n,) normalised innovation squared and its degrees of freedom, 0 without a
+          match.
         """
         with atomic_path(path) as aside:
             columns: dict[str, Any] = {name: self.column(name) for name in self._rows[0]}
@@ -114,7 +115,7 @@ def _se3(pose: NDArray[np.float64], dtype: np.dtype) -> jaxlie.SE3:
 
 
 def _covariance(tracked: ScanResult) -> NDArray[np.float64]:
-    """Carry the scan match's covariance from the lidar to the IMU at the scan's end."""
+    """Transform the scan match's covariance from the lidar to the IMU at the scan's end."""
     registration = tracked.output.registration
     T_world_lidar = pose_matrix(np.asarray(registration.T_world_lidar.wxyz_xyz))
     T_imu_lidar = np.linalg.inv(tracked.T_world_imu) @ T_world_lidar
@@ -197,11 +198,11 @@ class ScanLog(Sink):
     def finish(self, run: RunResult) -> None:
         """Write every column, one row a scan.
 
-        - ``scan`` number in the recording; ``points`` as recorded;
-        - ``matches`` points that found their counterpart in the map; ``rmse`` of their distances, m;
-        - ``iterations`` of the solve; ``unobserved`` directions of six;
-        - ``lost``: the pose is the prediction; ``failed``: metrics.json says why;
-        - ``NAME_ms`` of each stage; ``total_ms`` is what a scan took, ``decode_ms`` ran on another thread;
+        - ``scan`` index in the recording; ``points`` number of points as recorded;
+        - ``matches`` number of points with a counterpart in the map; ``rmse`` of their distances, m;
+        - ``iterations`` of the solver; ``unobserved`` number of unobserved directions of six;
+        - ``lost``: the pose is the prediction; ``failed``: metrics.json states why;
+        - ``NAME_ms`` time of each stage; ``total_ms`` time of the scan; ``decode_ms`` time on another thread;
           NaN where a run was interrupted.
 
         Args:
@@ -222,7 +223,7 @@ class ScanLog(Sink):
 
 
 _TOLERATED_SHARE = 0.05
-"""Share of points without room in the map that is normal at the edge of a well-filled table."""
+"""Share of points without room in the map up to which no warning is given: a well-filled table drops some."""
 
 
 class Overflow(Sink):

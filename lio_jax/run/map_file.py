@@ -1,4 +1,4 @@
-"""Point clouds on disk: PCD and PLY files, a map that grows during a run, and a map kept in tiles."""
+"""Point clouds on disk: PCD and PLY files, a map that grows during a run, and a map that is kept in tiles."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
@@ -17,26 +17,26 @@ CLOUD_ENDINGS = (".pcd", ".ply")
 
 
 def check_ending(path: Path) -> None:
-    """Refuse a file whose ending tells no format.
+    """Refuse a file whose ending is not that of a known format.
 
     Raises:
-        UsageError: it does not.
+        UsageError: the ending is unknown.
     """
     if path.suffix.lower() not in CLOUD_ENDINGS:
         raise UsageError(f"{path}: a map's name ends in {' or '.join(CLOUD_ENDINGS)}; choose one of them.")
 
 
 def write_cloud(path: Path, parts: Iterable[NDArray[np.float32]], count: int) -> None:
-    """Write points whole or not at all, in binary: PCD or, by the file's ending, PLY (little endian).
+    """Write points, complete or not at all, in binary: PCD or PLY (little endian), by the file's ending.
 
     Args:
-        path: of the file.
-        parts: arrays (n, 3) of points, m; taken one by one.
-        count: how many points the parts have together, which both formats say in front.
+        path: path of the file.
+        parts: arrays (n, 3) of points, m; they are taken one by one.
+        count: total number of points in the parts; both formats state it first.
 
     Raises:
-        UsageError: another ending.
-        ValueError: the parts have more points or fewer.
+        UsageError: the file has another ending.
+        ValueError: the parts have more points, or fewer.
     """
     check_ending(path)
     with atomic_path(path) as aside, aside.open("wb") as file:
@@ -50,13 +50,13 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
     """Return the (n, 3) points of a PCD, m.
 
     Raises:
-        LioJaxError: it cannot be read, or holds no x, y and z.
+        LioJaxError: the file cannot be read, or holds no x, y and z.
     """
     from pypcd4 import PointCloud
 
     try:
         return np.asarray(PointCloud.from_path(path).numpy(("x", "y", "z")), np.float32)
-    except Exception as error:  # the library's own, numpy's and pydantic's
+    except Exception as error:  # exceptions of the library, of numpy and of pydantic
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise LioJaxError(f"{path}: cannot be read as a PCD ({reason}); write it again.") from None
 
@@ -87,27 +87,27 @@ def _ply_header(count: int) -> bytes:
 
 
 _TILE_M = 40.0
-"""Edge of a tile, about: the ground is cut along x and y, and a tile holds whole voxels."""
+"""Approximate edge of a tile, m: the map is cut along x and y, and a tile holds whole voxels."""
 _KEPT = 2_000_000
-"""Points that are kept in memory before they go to their tiles."""
+"""Number of points that are kept in memory before they go to their tiles."""
 _FARTHEST = 1e6
-"""m; points farther from the origin are no part of a map."""
+"""Points farther from the origin than this are not part of a map, m."""
 _POINT = np.dtype(("<f4", 3))
 
 Tile = tuple[int, int]
 
 
 class MapTiles:
-    """Takes clouds one by one and writes their map: in each voxel the mean of the points that fell into it.
+    """Take clouds one by one and write their map: in each voxel the mean of the points in it.
 
-    Neither depends on the order of the tiles nor of the clouds, but for rounding.
+    Except for rounding, the map depends neither on the order of the tiles nor on the order of the clouds.
     """
 
     def __init__(self, folder: Path, voxel: float) -> None:
         """Begin an empty map.
 
         Args:
-            folder: for the tiles; made here, and left to the caller to remove.
+            folder: folder for the tiles; it is made here, and the caller removes it.
             voxel: edge length, m, 1 mm or more.
         """
         folder.mkdir(parents=True)
@@ -118,14 +118,14 @@ class MapTiles:
         self._waiting_count = 0
         self._tiles: set[Tile] = set()
         self.taken = 0
-        """How many points the clouds had that are finite."""
+        """Number of finite points in the clouds so far."""
 
     def add(self, T_world_imu: NDArray[np.float64], points: NDArray[np.float32]) -> None:
         """Add a cloud.
 
         Args:
-            T_world_imu: (4, 4).
-            points: (n, 3) m, in the IMU frame; those that are not finite are left out.
+            T_world_imu: (4, 4) pose of the cloud's frame.
+            points: (n, 3) m, in the IMU frame; points that are not finite are left out.
         """
         world = points.astype(np.float64) @ T_world_imu[:3, :3].T + T_world_imu[:3, 3]
         world = world[(np.abs(world) < _FARTHEST).all(axis=1)]
@@ -133,7 +133,7 @@ class MapTiles:
             return
         self.taken += len(world)
         tile = np.floor(world[:, :2] / self._voxel).astype(np.int64) // self._across
-        # from the tile's corner, where single precision is enough
+        # relative to the tile's corner, where single precision is enough
         world[:, :2] -= tile * (self._across * self._voxel)
         local = world.astype(np.float32)
         order = np.lexsort((tile[:, 1], tile[:, 0]))
@@ -146,7 +146,7 @@ class MapTiles:
             self._put_aside()
 
     def write(self, path: Path) -> int:
-        """Write the map, a PCD or PLY by the file's ending, and return how many points it has."""
+        """Write the map, as PCD or PLY by the file's ending, and return its number of points."""
         self._put_aside()
         tiles = sorted(self._tiles)
         counts = [self._thin(tile) for tile in tiles]
@@ -162,10 +162,10 @@ class MapTiles:
         self._waiting_count = 0
 
     def _thin(self, tile: Tile) -> int:
-        """Put world points, one per voxel, in place of a tile's; return how many there are."""
+        """Replace a tile's points by one world point per voxel; return their number."""
         local = np.fromfile(self._path(tile), _POINT).astype(np.float64)
         cell = np.floor(local / self._voxel).astype(np.int64)
-        # single precision may round onto the next tile's first voxel
+        # single precision may round a point into the next tile's first voxel
         cell[:, :2] = np.clip(cell[:, :2], 0, self._across - 1)
         cell[:, 2] -= cell[:, 2].min()
         key = (cell[:, 2] * self._across + cell[:, 1]) * self._across + cell[:, 0]
@@ -205,20 +205,20 @@ class MapFile(Sink):
         run.map_points = self.write()
 
     def append(self, points: NDArray[np.float32]) -> None:
-        """Add (n, 3) points, m in world."""
+        """Add (n, 3) points, m, world frame."""
         self._spool.write(np.ascontiguousarray(points, np.float32).tobytes())
 
     def write(self) -> NDArray[np.float32]:
         """Write the PCD (binary, x y z) and return its (n, 3) points; none can be added afterwards."""
         self._spool.close()
-        # an interrupted append may have left part of a point behind
+        # an interrupted append may have left a part of a point
         whole = self._spool_path.stat().st_size // _POINT_BYTES
         points = np.fromfile(self._spool_path, np.float32, 3 * whole).reshape(-1, 3)
         write_cloud(self._path, [points], len(points))
         return points
 
     def close(self) -> None:
-        """Remove the spool file, whatever happened."""
+        """Remove the spool file in every case."""
         self._spool.close()
         self._spool_path.unlink(missing_ok=True)
 

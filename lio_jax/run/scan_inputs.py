@@ -1,4 +1,4 @@
-"""Scans and inertial samples as the padded arrays of a step."""
+"""Turn scans and inertial samples into the padded arrays of a step."""
 
 from typing import Any
 
@@ -18,20 +18,20 @@ def bucket_for(count: int, config: ScanConfig) -> int:
 def padded(scan: LidarScan, last_end_ns: int | None, config: ScanConfig, size: int | None = None) -> Scan:
     """Copy a scan into zero-padded arrays of its bucket's size.
 
-    A scan larger than the largest bucket is thinned to it by an even stride. Points that are not finite are
-    left for the step's range check to drop.
+    A scan larger than the largest bucket is thinned to it by an even stride. Points that are not finite stay
+    in; the range check of the step drops them.
 
     Args:
-        scan: as recorded.
-        last_end_ns: end of the scan before, ns; None for the first.
+        scan: the scan as recorded.
+        last_end_ns: end of the previous scan, ns; None for the first scan.
         config: bucket sizes.
-        size: padded size; None: the bucket that fits.
+        size: padded size; None: the smallest bucket that fits.
     """
     count = len(scan.points)
     size = size or bucket_for(count, config)
     keep = slice(None) if count <= size else np.linspace(0, count - 1, size).astype(np.intp)
     interval = 0 if last_end_ns is None else scan.end_ns - last_end_ns
-    # host arrays: jit takes them as they are, one copy less than through jnp
+    # host arrays: jit takes them as they are, which saves one copy compared with jnp
     arrays: dict[str, Any] = {
         "points": _extended(scan.points[keep], size, np.float32),
         "time": _extended(scan.time[keep], size, np.float32),
@@ -45,7 +45,7 @@ def padded(scan: LidarScan, last_end_ns: int | None, config: ScanConfig, size: i
 
 
 def _extended(values: np.ndarray, size: int, dtype: type) -> np.ndarray:
-    """Return ``values`` followed by zeros; only the padding is cleared, because that costs time."""
+    """Return ``values`` followed by zeros; only the padding is cleared, to save time."""
     extended = np.empty((size, *values.shape[1:]), dtype)
     extended[: len(values)] = values
     extended[len(values) :] = 0
@@ -53,14 +53,14 @@ def _extended(values: np.ndarray, size: int, dtype: type) -> np.ndarray:
 
 
 OFFSET_MARGIN_S = 0.05
-"""How far an estimated time offset may move away from its first value without running out of samples, s."""
+"""Largest change of an estimated time offset from its first value for which samples are available, s."""
 
 _BRIDGE_S = 0.5
-"""A neighbouring sample farther than this from a scan's interval says nothing about the motion in it, s."""
+"""A neighbouring sample farther than this from a scan's interval does not describe the motion in it, s."""
 
 
 class ImuFeed:
-    """Cuts a recording's inertial samples into one padded batch per scan, in ascending order of scans."""
+    """Cut a recording's inertial samples into one padded batch per scan, for scans in ascending order."""
 
     def __init__(
         self,
@@ -70,14 +70,15 @@ class ImuFeed:
         margin_s: float = OFFSET_MARGIN_S,
         orientation: bool = False,
     ) -> None:
-        """Keep the recording's samples.
+        """Store the recording's samples.
 
         Args:
-            imu: stamps ascending strictly; None where the recording has none.
+            imu: samples with strictly ascending stamps; None where the recording has none.
             buckets: padded sizes, ascending.
             time_offset: a scan stamped t was taken at IMU time t + time_offset, s.
-            margin_s: how far an offset that is estimated may move from ``time_offset``; 0 where it is frozen.
-            orientation: hand the IMU's own orientations on, where it reports any.
+            margin_s: largest change of an estimated offset from ``time_offset``, s; 0 if the offset is
+                frozen.
+            orientation: whether to pass on the IMU's own orientations, where it reports them.
         """
         count = 0 if imu is None else len(imu.stamp_ns)
         self._imu = imu if count else None
@@ -96,18 +97,19 @@ class ImuFeed:
 
     @property
     def samples(self) -> ImuData | None:
-        """Return the recording's samples, None where it has none."""
+        """Return the recording's samples; None where it has none."""
         return self._imu
 
     def batch(self, scan: LidarScan, last_end_ns: int | None) -> ImuBatch:
-        """Return the samples from the last scan's end to this scan's, and the neighbours on both sides.
+        """Return the samples from the last scan's end to this scan's end, and the neighbours on both sides.
 
         Times count from the scan's start on the IMU's clock: the time offset is not subtracted. More samples
         than the largest padded size are thinned to it by an even stride. Padding repeats the last sample.
 
         Args:
-            scan: as recorded.
-            last_end_ns: end of the scan before, ns; None for the first, covered from its start.
+            scan: the scan as recorded.
+            last_end_ns: end of the previous scan, ns; None for the first scan, which is covered from its
+                start.
         """
         start_ns = scan.stamp_ns if last_end_ns is None else min(last_end_ns, scan.stamp_ns)
         first, last = self._range(start_ns, scan.end_ns)
@@ -118,14 +120,14 @@ class ImuFeed:
         return self._padded(first, last, scan.stamp_ns)
 
     def before(self, scan: LidarScan, seconds: float = 1.0) -> ImuBatch:
-        """Return the samples of the last ``seconds`` up to the scan's end, for a start at rest."""
+        """Return the samples of the last ``seconds`` up to the scan's end, for an initialisation at rest."""
         end_ns = scan.end_ns + self._offset_ns
         bounds = (end_ns - round(seconds * 1e9), end_ns)
         first, last = np.searchsorted(self._stamps, bounds).tolist()
         return self._padded(first, last, scan.stamp_ns)
 
     def warnings(self) -> list[str]:
-        """Return a sentence for each way in which the samples did not cover the scans so far."""
+        """Return one sentence for each way in which the samples failed to cover the scans so far."""
         if self._imu is None:
             return ["the recording holds no IMU samples: constant velocity predicts the motion."]
         sentences = []
@@ -144,14 +146,14 @@ class ImuFeed:
         return sentences
 
     def _range(self, start_ns: int, end_ns: int) -> tuple[int, int]:
-        """Return the first and one past the last sample that tell of the motion between two lidar times."""
+        """Return the first and one past the last sample for the motion between two lidar times."""
         start, end = start_ns + self._offset_ns, end_ns + self._offset_ns
         count = len(self._stamps)
-        # one neighbour beyond each end to interpolate with ...
+        # one neighbour beyond each end, for the interpolation,
         first = int(np.searchsorted(self._stamps, start - self._margin_ns, "right")) - 1
         last = int(np.searchsorted(self._stamps, end + self._margin_ns, "left"))
         first, last = max(first, 0), min(last, count - 1)
-        # ... unless it lies beyond a gap
+        # except where it is beyond a gap
         reach = self._margin_ns + round(_BRIDGE_S * 1e9)
         first += int(first < count and self._stamps[first] < start - reach)
         last -= int(last >= 0 and self._stamps[last] > end + reach)

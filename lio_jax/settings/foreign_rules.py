@@ -1,4 +1,4 @@
-"""How a key of another system's parameter file becomes settings; what the rules for all systems share."""
+"""Rules that turn keys of another system's parameter file into settings, and their shared parts."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -12,46 +12,50 @@ from scipy.spatial.transform import Rotation
 from lio_jax.core.errors import UsageError
 
 Take = Callable[[Any, str, Mapping[str, Any]], tuple[dict[str, Any], str]]
-"""From a key's value, its place for messages and all values by name: our settings by path, and a word on the
-conversion, or on why there are none."""
+"""Function of a key's value, of its place (for messages) and of all values by name.
+
+It returns this project's settings by path, and a remark on the conversion or on why there are no settings.
+"""
 
 
 @dataclass(frozen=True)
 class Rule:
-    """What is done with a key."""
+    """What is done with one key."""
 
     take: Take
+    """Function that converts the key's value."""
     method: bool = False
-    """The key belongs to the system's own method, not to the sensors."""
+    """Whether the key belongs to the system's own method, not to the sensors."""
 
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """Another program and its parameters."""
+    """Another program and the rules for its parameters."""
 
     name: str
+    """The program's name in messages."""
     recipe: str
-    """The recipe that stands for it."""
+    """The recipe that follows this program's method."""
     rules: Mapping[str, Rule]
-    """By the key's name without sections."""
+    """Rules by the key's name without sections."""
     sections: tuple[str, ...] = ()
-    """Those that a file has to have."""
+    """Names of the sections that a file must have."""
     other_sections: Mapping[str, Rule] = field(default_factory=dict)
-    """Sections of which all keys go the same way."""
+    """Rules for sections whose keys are all treated alike."""
 
 
 def same(*paths: str, word: str = "", method: bool = False) -> Rule:
-    """Return the rule of a key that means the same here: under the names ``paths``."""
+    """Return the rule of a key that has the same meaning here, under the names ``paths``."""
     return Rule(lambda value, place, values: (dict.fromkeys(paths, value), word), method)
 
 
 def converted(*paths: str, by: Callable[[Any, str], Any], word: str, method: bool = False) -> Rule:
-    """Return the rule of a key whose value is converted: ``by(value, place)``."""
+    """Return the rule of a key whose value is converted by ``by(value, place)``."""
     return Rule(lambda value, place, values: (dict.fromkeys(paths, by(value, place)), word), method)
 
 
 def nothing(why: str) -> Rule:
-    """Return the rule of a key without counterpart."""
+    """Return the rule of a key that has no counterpart here."""
     return Rule(lambda value, place, values: ({}, why))
 
 
@@ -59,7 +63,7 @@ def number(value: Any, place: str) -> float:
     """Return a finite number; YAML reads 1e-3 as text.
 
     Raises:
-        UsageError: it is none.
+        UsageError: the value is no finite number.
     """
     try:
         result = math.nan if isinstance(value, bool) else float(value)
@@ -74,7 +78,7 @@ def whole_number(value: Any, place: str) -> int:
     """Return a whole number.
 
     Raises:
-        UsageError: it is none.
+        UsageError: the value is no whole number.
     """
     result = number(value, place)
     if result != int(result):
@@ -86,7 +90,7 @@ def flag(value: Any, place: str) -> bool:
     """Return true or false.
 
     Raises:
-        UsageError: it is neither.
+        UsageError: the value is neither.
     """
     if not isinstance(value, bool):
         raise UsageError(f"{place} = {value!r} must be true or false.")
@@ -97,7 +101,7 @@ def vector(value: Any, place: str, count: int = 3) -> NDArray[np.float64]:
     """Return a list of ``count`` numbers, (count,).
 
     Raises:
-        UsageError: it is none.
+        UsageError: the value is no such list.
     """
     if not isinstance(value, list) or len(value) != count:
         raise UsageError(f"{place} = {value!r} must be a list of {count} numbers.")
@@ -105,14 +109,14 @@ def vector(value: Any, place: str, count: int = 3) -> NDArray[np.float64]:
 
 
 _ROUNDING = 1e-3
-"""Files write matrices with as few as three digits; the nearest rotation is taken."""
+"""Largest accepted deviation from an orthonormal matrix: files write as few as three digits."""
 
 
 def rotation(value: Any, place: str) -> Rotation:
-    """Return the rotation of nine numbers, row by row, or of three rows.
+    """Return the rotation given by nine numbers, row by row, or by three rows; the nearest rotation is taken.
 
     Raises:
-        UsageError: wrong shape, or not orthonormal: the message suggests the nearest rotation.
+        UsageError: wrong shape, or not orthonormal; the message suggests the nearest rotation.
     """
     if isinstance(value, list) and len(value) == 3 and all(isinstance(row, list) for row in value):
         value = [item for row in value for item in row]
@@ -133,5 +137,5 @@ def rotation(value: Any, place: str) -> Rotation:
 
 
 def quaternion(turn: Rotation) -> list[float]:
-    """Return x y z w with w not negative, as ``params.extrinsics.rotation`` takes it."""
+    """Return the quaternion x y z w with w not negative, the form of ``params.extrinsics.rotation``."""
     return [float(item) for item in turn.as_quat(canonical=True) + 0.0]

@@ -1,4 +1,4 @@
-"""FAST-LIO2's parameters in this project's terms.
+"""Translate FAST-LIO2's parameters into this project's settings.
 
 Its ``extrinsic_R`` and ``extrinsic_T`` are the lidar's pose in the IMU frame, T_imu_lidar as here.
 """

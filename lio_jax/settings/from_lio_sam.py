@@ -1,9 +1,9 @@
-"""LIO-SAM's parameters in this project's terms.
+"""Translate LIO-SAM's parameters into this project's settings.
 
-Its ``extrinsicRot`` turns the IMU's vectors into the lidar's axes; ``extrinsicTrans`` is where the IMU lies
-in the lidar frame: what it calls lidar2Imu moves by +extrinsicTrans and stands behind the lidar's pose, once
-the samples are turned. Together they are T_lidar_imu, the inverse of ``params.extrinsics``; for KITTI its
-authors fill in calib_imu_to_velo.
+Its ``extrinsicRot`` rotates vectors from the IMU's axes to the lidar's axes. Its ``extrinsicTrans`` is the
+position of the IMU in the lidar frame: the transform that it calls lidar2Imu translates by +extrinsicTrans
+and multiplies the lidar's pose from the right, after the samples are rotated. Together they are T_lidar_imu,
+the inverse of ``params.extrinsics``. For KITTI its authors fill in calib_imu_to_velo.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from lio_jax.core.errors import UsageError
 from lio_jax.settings.foreign_rules import Rule, System, nothing, quaternion, rotation, same, vector
 
 _SAME_AXES = 0.02
-"""Rotations are of the same axes if they differ by less, rad."""
+"""Two rotations are taken as equal if they differ by less than this angle, rad."""
 _FROM_NAVSAT = "odometry/gps"
 
 _OUTPUT = "names or draws what its nodes publish; a run writes a folder"
@@ -37,7 +37,7 @@ def _extrinsic_trans(value: Any, place: str, values: Mapping[str, Any]) -> tuple
 
 
 def _extrinsic_rpy(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
-    # its versions differ in whether they invert the matrix before they use it
+    # some versions invert the matrix before they use it, others do not
     of_orientations, of_samples = rotation(value, place), _rot_beside(place, values)
     if any((of_orientations * other).magnitude() < _SAME_AXES for other in (of_samples, of_samples.inv())):
         return {}, (
@@ -127,7 +127,7 @@ LIO_SAM = System(
         "historyKeyframeSearchTimeDiff": _of_method("params.loop.time_gap", _WITH_LOOPS),
         "historyKeyframeSearchNum": _of_method("config.loops.submap_keyframes", _WITH_LOOPS),
         "historyKeyframeFitnessScore": nothing("params.loop.* has tests of its own for a loop"),
-        "loopClosureFrequency": nothing("every keyframe is compared, beside the odometry"),
+        "loopClosureFrequency": nothing("every keyframe is compared, in parallel with the odometry"),
         "surroundingKeyframeSize": nothing("params.submap.* says which keyframes are matched with"),
         **dict.fromkeys(
             (

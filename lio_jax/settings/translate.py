@@ -1,8 +1,7 @@
-"""What a parameter file of LIO-SAM or FAST-LIO2 says, in this project's names, units and conventions.
+"""Read a parameter file of LIO-SAM or FAST-LIO2 into this project's names, units and conventions.
 
-ROS 1 and ROS 2 files are read, ``lio_sam: {...}`` and ``/**: {ros__parameters: {...}}``. Facts about the
-sensors go with any recipe; what belongs to the system's own method is taken by the recipe that stands for it
-alone.
+Files of ROS 1 (``lio_sam: {...}``) and of ROS 2 (``/**: {ros__parameters: {...}}``) are read. Settings of the
+sensors apply to every recipe. Settings of the system's own method apply only to the recipe that follows it.
 """
 
 from collections.abc import Mapping
@@ -26,22 +25,23 @@ _PARAMETERS = "ros__parameters"
 
 @dataclass(frozen=True)
 class ForeignKey:
-    """One key of the file and what became of it."""
+    """One key of the file, and how it was understood."""
 
     key: str
-    """As the file has it, sections joined by dots."""
+    """Name of the key in the file, sections joined by dots."""
     value: Any
+    """Value of the key in the file."""
     settings: Mapping[str, Any]
-    """Ours by path; empty: there is no counterpart."""
+    """This project's settings by path; empty: there is no counterpart."""
     word: str
-    """On the conversion, or why there is no counterpart."""
+    """Remark on the conversion, or on why there is no counterpart."""
     method: bool
-    """Belongs to the system's method: other recipes do not take it."""
+    """Whether the key belongs to the system's own method: other recipes do not take it."""
 
 
 @dataclass(frozen=True)
 class ForeignSettings:
-    """A whole file."""
+    """All keys of one parameter file."""
 
     source: str
     """The file's name."""
@@ -53,7 +53,7 @@ class ForeignSettings:
         return tuple(k for k in self.keys if k.settings and (recipe == self.system.recipe or not k.method))
 
     def applied_to(self, settings: Settings) -> Settings:
-        """Return settings with those of the file that their recipe takes.
+        """Return the settings with those values of the file that their recipe takes.
 
         Raises:
             UsageError: a value is impossible; the message names file and key.
@@ -68,7 +68,7 @@ def load_foreign_settings(path: Path) -> ForeignSettings:
     """Read a parameter file of another system.
 
     Raises:
-        UsageError: unreadable, of no system known here, without its sections, or with an impossible value;
+        UsageError: unreadable, of a system unknown here, without its sections, or with an impossible value;
             the message names file and key.
     """
     try:
@@ -81,11 +81,11 @@ def load_foreign_settings(path: Path) -> ForeignSettings:
 
 
 def foreign_settings_from_yaml(text: str, source: str) -> ForeignSettings:
-    """Read the text of such a file; see :func:`load_foreign_settings`.
+    """Read the text of a parameter file; see :func:`load_foreign_settings`.
 
     Args:
-        text: YAML.
-        source: file name for messages.
+        text: the file's text, YAML.
+        source: file name in messages.
     """
     values, section = _parameters(_parsed(text, source), source)
     found = {system: sum(_name(key) in system.rules for key in values) for system in SYSTEMS}
@@ -121,7 +121,7 @@ def _rule(system: System, key: str) -> Rule:
 
 
 def _name(key: str) -> str:
-    # forks move parameters from section to section; the names are unique without them
+    # forks move parameters between sections; the names are unique without the sections
     return key.rpartition(".")[2]
 
 
@@ -138,7 +138,7 @@ def _parsed(text: str, source: str) -> Any:
 
 
 def _parameters(tree: Any, source: str) -> tuple[dict[str, Any], str]:
-    """Return values by dotted key, and the section around them; "" where there is none."""
+    """Return the values by dotted key, and the name of the section around them; "" if there is none."""
     if not isinstance(tree, dict):
         raise UsageError(f"{source}: expected parameters by name, found {tree!r}.")
     dicts = {name: node for name, node in tree.items() if isinstance(node, dict)}

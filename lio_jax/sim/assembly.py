@@ -1,4 +1,4 @@
-"""From the rows that builders write to a World of float64 arrays."""
+"""Assemble a World of float64 arrays from the rows that builders write."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from lio_jax.sim.primitives import Boxes, Cylinders, Grounds, Planes, Spheres, T
 from lio_jax.sim.worlds import Movers, Solids, World
 
 Rows = NDArray[np.float64] | Sequence[Sequence[float | int]]
-"""A table, one solid a row."""
+"""A table with one solid in each row."""
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,13 @@ class Terrain:
     """A sloping ground: z = sum of amplitude sin(wave . (x, y) + phase)."""
 
     amplitude: NDArray[np.float64]
-    """(w,) m."""
+    """Amplitude of each wave, (w,) m."""
     wave: NDArray[np.float64]
-    """(w, 2) rad/m."""
+    """Wave vectors, (w, 2) rad/m."""
     phase: NDArray[np.float64]
-    """(w,) rad."""
+    """Phase of each wave at the builder's origin, (w,) rad."""
     reflectivity: float
+    """Share of the light that comes back at normal incidence, 0 to 1."""
 
     def height(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the height (m) at (..., 2) positions (m)."""
@@ -42,15 +43,15 @@ class Traffic:
     """Bodies on closed paths and the boxes they are made of; see Movers."""
 
     path: NDArray[np.float64]
-    """(m, k, 3) m."""
+    """Positions of each body at equal steps of its period, (m, k, 3) m, builder's frame."""
     yaw: NDArray[np.float64]
-    """(m, k) rad."""
+    """Heading of each body at those positions, (m, k) rad."""
     period: NDArray[np.float64]
-    """(m,) s."""
+    """Duration of a lap of each body, (m,) s."""
     body: NDArray[np.int64]
-    """(n,)."""
+    """Index of the body to which each box belongs, (n,)."""
     boxes: NDArray[np.float64]
-    """(n, 8): see assembled."""
+    """Box rows in their body's frame, (n, 8): centre 3, half size 3 (m), yaw (rad), reflectivity."""
 
 
 def assembled(
@@ -67,17 +68,17 @@ def assembled(
     """Return the world whose origin is at ``origin`` of the builder's frame.
 
     Args:
-        origin: (3,) m.
+        origin: the world's origin in the builder's frame, (3,) m.
         planes: rows of point 3, normal 3, reflectivity.
         terrain: the ground, if it is not a plane or boxes.
         boxes: rows of centre 3, half size 3, yaw, reflectivity.
         tilted: rows of centre 3, half size 3, rotation matrix row by row 9, reflectivity.
         cylinders: rows of base centre 3, radius, height, reflectivity.
         spheres: rows of centre 3, radius, reflectivity.
-        traffic: what moves.
+        traffic: the bodies that move; None: nothing moves.
 
     Returns:
-        float64 arrays whatever JAX's mode; angles in rad, lengths in m.
+        The world in float64 arrays, in every mode of JAX; angles in rad, lengths in m.
     """
     origin = np.asarray(origin, float)
     point, *plane = _columns(planes, 3, 3, 1)

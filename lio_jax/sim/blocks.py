@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 PITCH = np.array([80.0, 60.0])
 """Distance between street axes along x and y, m."""
 HALF_STREET = 7.0
-"""From a street's axis to the building line, m."""
+"""Distance from a street's axis to the building line, m."""
 BLOCKS = [(i, j) for i in range(-1, 3) for j in range(-1, 3)]
 """Column and row of each block; its low corner is where the axes cross at (column, row) * PITCH."""
 LANE = 1.5
-"""From a street's axis to the axis of the driven (right) lane, m."""
+"""Distance from a street's axis to the axis of the driven (right) lane, m."""
 LAP_BLOCKS = [(0, 0), (1, 0), (0, 1)]
 """The blocks that the lap goes around."""
 _CORNERS = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]])
@@ -22,17 +22,21 @@ _START = np.array([2 * PITCH[0] - 27.0, -LANE])
 
 @dataclass(frozen=True)
 class Sides:
-    """Block sides seen from the street: start, direction along the side, direction into the block."""
+    """Block sides as seen from the street."""
 
     start: NDArray[np.float64]
+    """Where each side begins, (n, 2) m."""
     along: NDArray[np.float64]
+    """Unit direction along each side, (n, 2)."""
     inward: NDArray[np.float64]
+    """Unit direction from the street into the block, (n, 2)."""
     length: NDArray[np.float64]
+    """Length of each side, (n,) m."""
 
     def points(
         self, side: NDArray[np.int64], along: NDArray[np.float64], inward: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the positions (n, 2) so far along a side and so far into its block, m."""
+        """Return positions (n, 2), m, from the distances along a side and into its block, m."""
         return self.start[side] + along[:, None] * self.along[side] + inward[:, None] * self.inward[side]
 
     def yaw(self, side: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -42,7 +46,11 @@ class Sides:
     def slots(
         self, pitch: float, margin: float
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-        """Cut every side, less a margin at both ends, into equal slots: index of side, middle, width."""
+        """Cut every side into equal slots, with a margin (m) left at both ends.
+
+        Returns:
+            Index of each slot's side, distance of its middle from the side's start (m), its width (m).
+        """
         counts = np.maximum(1, np.round((self.length - 2 * margin) / pitch)).astype(int)
         width = (self.length - 2 * margin) / counts
         side = np.repeat(np.arange(len(counts)), counts)
@@ -71,7 +79,7 @@ def block_corners(block: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def lap() -> NDArray[np.float64]:
-    """Return the vertices (n, 2) of a lap in the right lane, m; it starts in a street, along +x."""
+    """Return the vertices (n, 2) of a lap in the right lane, m; the lap starts in a street, along +x."""
     corners = _CORNERS * PITCH
     arrive = np.sign(corners - np.roll(corners, 1, axis=0))
     leave = np.sign(np.roll(corners, -1, axis=0) - corners)

@@ -9,12 +9,12 @@ from lio_jax.sim.traffic import Loop, car_boxes, traffic
 from lio_jax.sim.worlds import Route, Scene
 
 _BODY_HEIGHT = 1.6
-"""Of the body frame above the ground, m."""
+"""Height of the body frame above the ground, m."""
 _KERB_LINE = 1.9
-"""From the building line to the kerb, m."""
+"""Distance from the building line to the kerb, m."""
 _KERB_HEIGHT = 0.14
 _SIDE_BLOCKS = [(-1, -1), (2, -1), (2, 1), (1, 2)]
-"""Blocks at crossings of the lap which a clockwise loop can hug without crossing it."""
+"""Blocks at crossings of the lap: a clockwise loop around one of them never crosses the lap."""
 _ASPHALT, _PAVEMENT = 0.15, 0.3
 
 
@@ -53,7 +53,7 @@ def _route(terrain: Terrain) -> NDArray[np.float64]:
     path = []
     for here, there in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         length = float(np.linalg.norm(there - here))
-        # vertices every 12 m or so follow the slope, but leave the turns their room
+        # vertices about every 12 m follow the slope; none is so near a turn that it limits the radius
         passed = np.append(0.0, np.linspace(14, length - 14, int((length - 28) / 12) + 1))
         path.append(here + passed[:, None] * (there - here) / length)
     plan = np.concatenate(path)
@@ -79,7 +79,7 @@ def _houses(sides: Sides, terrain: Terrain, rng: np.random.Generator) -> NDArray
 
 
 def _pavements(sides: Sides, terrain: Terrain) -> NDArray[np.float64]:
-    """Return slabs along all sides, each in the slope of the ground at its middle."""
+    """Return slabs along all sides, each tilted as the ground is at the slab's middle."""
     ring = Sides(
         sides.start - _KERB_LINE * (sides.along + sides.inward),
         sides.along,
@@ -141,6 +141,6 @@ def _traffic(terrain: Terrain, rng: np.random.Generator) -> Traffic:
     count = sum(loop.bodies for loop in loops)
     length, height, reflectivity = draws(rng, count, (3.8, 4.8), (1.4, 1.8), (0.1, 0.9))
     boxes = car_boxes(np.zeros((count, 3)), np.zeros(count), length, height, reflectivity)
-    # a body and a cabin each
+    # each car has a body and a cabin
     bodies = [boxes[[number, number + count]] for number in range(count)]
     return traffic(loops, terrain.height, bodies, rng)

@@ -1,4 +1,4 @@
-"""Does a body run into anything? Rays around and along its path tell, before anything is simulated."""
+"""Check by rays that a body's path meets no surface, before anything is simulated."""
 
 from itertools import product
 
@@ -17,30 +17,30 @@ CLEARANCE = 0.2
 """Radius around the body's origin that has to stay free, m."""
 
 STEP = 0.02
-"""Time between the positions that are to be checked, s: at 20 m/s nothing passes twice CLEARANCE unseen."""
+"""Time between the checked positions, s: at 20 m/s the body moves by twice CLEARANCE in it."""
 
 TOGETHER = 10
-"""Positions that share one placing of what moves: 0.2 s."""
+"""Number of consecutive positions for which moving bodies are placed once: 0.2 s."""
 _GROUPS = 64
-"""Of positions, checked by one call."""
+"""Number of groups of positions that one call checks."""
 
 _AROUND = np.array([way for way in product((-1.0, 0.0, 1.0), repeat=3) if any(way)])
 _AROUND /= np.linalg.norm(_AROUND, axis=1, keepdims=True)
 
 
 def check_clear(world: World, times: NDArray[np.float64], positions: NDArray[np.float64]) -> None:
-    """Raise unless the body can go straight from position to position, and nothing is within ``CLEARANCE``.
+    """Raise unless the straight path from position to position is free with ``CLEARANCE`` around it.
 
-    Around each position 26 rays are cast, 45 degrees apart or less, so that a pole thinner than 0.15 m may
-    come closer than ``CLEARANCE`` unseen, though not be driven through.
+    26 rays are cast around each position, at most 45 degrees apart. A pole thinner than 0.15 m may therefore
+    come closer than ``CLEARANCE`` undetected, but the path cannot pass through it.
 
     Args:
-        world: what must not be touched.
-        times: (n,) of the positions, ascending by ``STEP``, s.
-        positions: (n, 3) of the body, world frame, m.
+        world: the surfaces that must not be touched.
+        times: times of the positions, (n,) s, ascending by ``STEP``.
+        positions: positions of the body, (n, 3) m, world frame.
 
     Raises:
-        UsageError: the first time and place where it comes too close.
+        UsageError: the body comes too close to a surface; the message names the first time and place.
     """
     if len(times) == 0:
         return
@@ -52,7 +52,7 @@ def check_clear(world: World, times: NDArray[np.float64], positions: NDArray[np.
         counts = counts_along(world, jnp.asarray(positions[::TOGETHER]), radius)
     size = _GROUPS * TOGETHER
     for start in range(0, len(times), size):
-        # the last call's surplus repeats the last position: every call has one shape
+        # the last call repeats the last position to fill its shape, so that every call has one shape
         rows = np.minimum(np.arange(start, start + size), len(times) - 1)
         with jax.enable_x64(True):
             instants, places, ways = (
@@ -93,7 +93,7 @@ def _group_touched(
 ) -> Bool[Array, " n"]:
     part, _ = nearest_part(world, positions[0], times[0, 0], counts)
     step = jnp.linalg.norm(ahead, axis=1, keepdims=True)
-    # a body at rest looks along x, and no further than its clearance
+    # a body at rest has no direction of motion: its ray points along x and is as long as the clearance
     forward = jnp.where(step > 0, ahead / jnp.where(step > 0, step, 1), jnp.array([1.0, 0.0, 0.0]))
     around = jnp.broadcast_to(jnp.asarray(_AROUND), (len(times), *_AROUND.shape))
     rays = jnp.concatenate([forward[:, None], around], axis=1)

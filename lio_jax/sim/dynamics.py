@@ -1,4 +1,4 @@
-"""How a body moves about its route: cars heave, hands swing with the gait and look around, drones bank."""
+"""How a body moves about its route: a car heaves, a hand swings with the gait, a drone banks."""
 
 from dataclasses import dataclass
 
@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 from lio_jax.sim.worlds import Dynamics
 
 CHANNELS = ("forward", "left", "up", "roll", "pitch", "yaw")
-"""Of the sway: offsets (m) along the heading, then turns (rad) about the body's axes."""
+"""Channels of the sway: offsets (m) along heading, left and up, then turns (rad) about the body's axes."""
 
 
 class Sway(eqx.Module):
-    """Sums of sinusoids per channel of ``CHANNELS``."""
+    """Sums of sinusoids, one sum for each of ``CHANNELS``."""
 
     amplitude: Float[Array, "6 modes"]
-    """m or rad."""
+    """Amplitude of each sinusoid, m (first three channels) or rad."""
     frequency: Float[Array, "6 modes"]
-    """Hz."""
+    """Frequency of each sinusoid, Hz."""
     phase: Float[Array, "6 modes"]
-    """rad."""
+    """Phase of each sinusoid at time 0, rad."""
 
     def at(self, time: Float[Array, ""]) -> Float[Array, "6"]:
         """Return the six offsets at ``time`` s."""
@@ -32,10 +32,10 @@ class Sway(eqx.Module):
 
 @dataclass(frozen=True)
 class Handling:
-    """How fast a body goes where."""
+    """Accelerations that limit how fast a body follows its route."""
 
     lateral: float
-    """Acceleration in corners, m/s^2."""
+    """Lateral acceleration in corners, m/s^2."""
     braking: float
     """Mean deceleration ahead of corners, m/s^2."""
     acceleration: float
@@ -82,7 +82,7 @@ _LOOKING: dict[str, tuple[float, list[float]]] = {
     "pitch": (0.5, [0.23, 0.41]),
     "roll": (0.4, [0.19, 0.37]),
 }
-"""Share of the swing rate and frequencies (Hz) at 1 rad/s with which a hand looks around."""
+"""Share of the swing rate, and frequencies (Hz) at 1 rad/s, with which a hand looks around."""
 
 
 def sway(dynamics: Dynamics, swing_rate: float, seed: int) -> Sway:
@@ -90,15 +90,15 @@ def sway(dynamics: Dynamics, swing_rate: float, seed: int) -> Sway:
 
     Args:
         dynamics: what kind of body.
-        swing_rate: bound of a hand's angular rate from looking around, rad/s.
-        seed: of the phases and of up to 5 % of every frequency.
+        swing_rate: bound on the angular rate with which a handheld body looks around, rad/s.
+        seed: seed of the phases, and of a change of each frequency by up to 5 %.
 
     Returns:
-        Float64 where JAX's x64 mode is on.
+        The sway, in float64 where JAX's x64 mode is on.
     """
     modes = {channel: list(_MODES[dynamics].get(channel, [])) for channel in CHANNELS}
     if dynamics == "handheld":
-        # faster swings are both wider and quicker
+        # a faster swing is both wider and quicker
         quicker = np.sqrt(swing_rate)
         for channel, (share, frequencies) in _LOOKING.items():
             amplitudes = [share * quicker / (2 * np.pi * base * len(frequencies)) for base in frequencies]
@@ -116,7 +116,7 @@ def sway(dynamics: Dynamics, swing_rate: float, seed: int) -> Sway:
 def bank_angles(
     control: NDArray[np.float64], knot_rate: float, dynamics: Dynamics, closed: bool
 ) -> NDArray[np.float64]:
-    """Return the roll (rad) at each control point of the path at full speed, smoothed over about a second."""
+    """Return the roll (rad) at each control point of the path at full speed, smoothed over about 1 s."""
     if dynamics == "handheld":
         return np.zeros(len(control))
     before, after = (np.roll(control, shift, axis=0) for shift in (1, -1))

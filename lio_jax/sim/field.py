@@ -22,7 +22,7 @@ _ROUTE = np.array(
 )
 """Vertices (x, y, height above ground), m."""
 _CLEAR = 6.0
-"""Nothing grows closer to the route than this in plan, m."""
+"""Horizontal distance from the route within which nothing grows, m."""
 
 
 def field(seed: int) -> Scene:

@@ -1,4 +1,4 @@
-"""A GPS receiver at the body's origin: white noise, slow multipath errors it does not know of, outages."""
+"""A GPS receiver at the body's origin: white noise, slow unreported multipath errors, outages."""
 
 import math
 from dataclasses import dataclass
@@ -16,14 +16,17 @@ from lio_jax.sim.trajectory import Motion, pose_at
 
 @dataclass(frozen=True)
 class GpsModel:
-    """Rate, noise and faults."""
+    """Rate, noise and faults of a receiver."""
 
     rate: float = 5.0
     """Fixes per second."""
     noise: tuple[float, float, float] = (0.3, 0.3, 0.6)
-    """Standard deviation of a fix: east, north, up, m. It is what the reported covariance states."""
+    """Standard deviation of a fix to the east, to the north and up, m; the reported covariance states it."""
     multipath: float = 0.5
-    """Standard deviation of the slow error, east and north, m; twice as much up. It is not reported."""
+    """Standard deviation of the slow error to the east and to the north, m; up it is twice as large.
+
+    The reported covariance does not include it.
+    """
     multipath_time: float = 30.0
     """Correlation time of the slow error, s."""
     outage_every: float = math.inf
@@ -31,7 +34,7 @@ class GpsModel:
     outage_length: float = 20.0
     """Mean length of an outage, s."""
     origin: tuple[float, float, float] = (48.1, 11.6, 520.0)
-    """Latitude deg, longitude deg, altitude m of the world's origin."""
+    """Latitude (deg), longitude (deg) and altitude (m) of the world's origin."""
 
 
 def simulate_gps(motion: Motion, model: GpsModel, duration_s: float, seed: int, start_ns: int = 0) -> GpsData:
@@ -41,14 +44,14 @@ def simulate_gps(motion: Motion, model: GpsModel, duration_s: float, seed: int, 
     process and last exponentially distributed times.
 
     Args:
-        motion: of the IMU's frame, where the antenna sits, too.
+        motion: motion of the IMU frame; the antenna is at its origin.
         model: the receiver.
-        duration_s: s.
-        seed: of all errors; a longer recording begins with the same numbers.
+        duration_s: length of the recording, s.
+        seed: seed of all errors; a longer recording begins with the same numbers.
         start_ns: absolute time of the motion's time 0, ns.
 
     Raises:
-        UsageError: a duration, rate or spread that is impossible.
+        UsageError: a duration, rate or standard deviation that is impossible.
     """
     _check(model, duration_s)
     count = math.floor(duration_s * model.rate + 1e-6) + 1
@@ -57,7 +60,7 @@ def simulate_gps(motion: Motion, model: GpsModel, duration_s: float, seed: int, 
     noise_key, outage_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), 3))
     with jax.enable_x64(True):
         true = np.asarray(_positions(motion, jnp.asarray(times)))
-        # a key per fix, so that the draws do not depend on how many there are
+        # each fix has its own key, so that the draws do not depend on the number of fixes
         keys = jax.vmap(lambda number: jax.random.fold_in(noise_key, number))(jnp.arange(count))
         draws = np.asarray(jax.vmap(lambda key: jax.random.normal(key, (2, 3), jnp.float64))(keys))
     kept = ~_in_outage(times, model, outage_key)

@@ -1,4 +1,4 @@
-"""An inertial measurement unit at the body's origin: exact motion, then its own errors, all of them known."""
+"""An inertial measurement unit at the body's origin: exact motion, then sensor errors that are all known."""
 
 import math
 from dataclasses import dataclass, replace
@@ -16,10 +16,10 @@ from lio_jax.data.sequence import ImuData
 from lio_jax.sim.trajectory import Kinematics, Motion, kinematics_at
 
 GRAVITY = np.array([0.0, 0.0, -9.80665])
-"""In world, m/s^2."""
+"""Gravity in the world frame, m/s^2."""
 
 _CHUNK = 4096
-"""Samples at a time: bounds memory, and draws the same numbers however long the recording."""
+"""Number of samples computed at once, to bound memory; the draws do not depend on the recording's length."""
 
 _SPREADS = (
     "gyro_noise",
@@ -33,36 +33,36 @@ _SPREADS = (
 
 @dataclass(frozen=True)
 class ImuModel:
-    """Rate, noise densities and faults; the default is a good MEMS unit."""
+    """Rate, noise densities and faults of a unit; the default is a good MEMS unit."""
 
     rate: float = 200.0
     """Samples per second."""
     gyro_noise: float = 0.003 / math.sqrt(200)
-    """rad/s/sqrt(Hz)."""
+    """White noise density of the gyroscope, rad/s/sqrt(Hz)."""
     accel_noise: float = 0.03 / math.sqrt(200)
-    """m/s^2/sqrt(Hz)."""
+    """White noise density of the accelerometer, m/s^2/sqrt(Hz)."""
     gyro_bias_walk: float = 2e-5
-    """rad/s^2/sqrt(Hz)."""
+    """Random-walk density of the gyroscope's bias, rad/s^2/sqrt(Hz)."""
     accel_bias_walk: float = 2e-4
-    """m/s^3/sqrt(Hz)."""
+    """Random-walk density of the accelerometer's bias, m/s^3/sqrt(Hz)."""
     gyro_bias: ArrayLike = 0.0
-    """Mean of the initial bias, rad/s: one number or three."""
+    """Mean of the gyroscope's initial bias, rad/s: one number or three."""
     accel_bias: ArrayLike = 0.0
-    """Mean of the initial bias, m/s^2: one number or three."""
+    """Mean of the accelerometer's initial bias, m/s^2: one number or three."""
     gyro_bias_sigma: float = 0.002
-    """Spread of the initial bias, rad/s."""
+    """Standard deviation of the gyroscope's initial bias, rad/s."""
     accel_bias_sigma: float = 0.02
-    """Spread of the initial bias, m/s^2."""
+    """Standard deviation of the accelerometer's initial bias, m/s^2."""
     gyro_gain: ArrayLike = 1.0
-    """Factor of the true rate: a number, or 3x3 with scale on and misalignment off the diagonal."""
+    """Factor of the true angular rate: a number, or 3x3 with scale on and misalignment off the diagonal."""
     accel_gain: ArrayLike = 1.0
-    """Factor of the true specific force, likewise."""
+    """Factor of the true specific force: a number, or 3x3 with scale on and misalignment off the diagonal."""
     time_offset: float = 0.0
     """A sample's stamp minus its true time, s."""
     gyro_range: float = math.radians(2000)
-    """Readings saturate here, rad/s."""
+    """Angular rate at which a reading saturates, rad/s."""
     accel_range: float = 16 * 9.80665
-    """Readings saturate here, m/s^2."""
+    """Specific force at which a reading saturates, m/s^2."""
 
     def noiseless(self) -> "ImuModel":
         """Return the same unit without noise and biases."""
@@ -71,18 +71,18 @@ class ImuModel:
 
 @dataclass(frozen=True)
 class ImuTruth:
-    """What the samples do not tell."""
+    """The true quantities behind the samples."""
 
     stamp_ns: NDArray[np.int64]
-    """(m,) true time of each sample, ns; ImuData holds the unit's own stamps."""
+    """True time of each sample, (m,) ns; ImuData holds the stamps of the unit's own clock."""
     gyro_bias: NDArray[np.float64]
-    """(m, 3) rad/s."""
+    """True bias of the gyroscope at each sample, (m, 3) rad/s."""
     accel_bias: NDArray[np.float64]
-    """(m, 3) m/s^2."""
+    """True bias of the accelerometer at each sample, (m, 3) m/s^2."""
     model: ImuModel
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return all of it by name, as it is stored beside a recording."""
+        """Return all quantities by name, as a recording stores them."""
         return {
             "imu_stamp_ns": self.stamp_ns,
             "gyro_bias": self.gyro_bias,
@@ -98,7 +98,7 @@ class ImuTruth:
 
 
 def specific_force(kinematics: Kinematics) -> Float[Array, "3"]:
-    """Return what an ideal accelerometer at the IMU's origin feels, IMU frame, m/s^2: R' (a - g)."""
+    """Return what an ideal accelerometer at the IMU's origin measures, IMU frame, m/s^2: R' (a - g)."""
     felt = kinematics.acceleration - jnp.asarray(GRAVITY, kinematics.acceleration.dtype)
     return kinematics.T_world_imu.rotation().inverse() @ felt
 
@@ -106,16 +106,16 @@ def specific_force(kinematics: Kinematics) -> Float[Array, "3"]:
 def simulate_imu(
     motion: Motion, model: ImuModel, duration_s: float, seed: int, start_ns: int = 0
 ) -> tuple[ImuData, ImuTruth]:
-    """Sample a motion as the unit would, from time 0 to ``duration_s``, both ends included.
+    """Sample a motion as the unit would do, from time 0 to ``duration_s``, both ends included.
 
     White noise of density N has the standard deviation N sqrt(rate) in a sample; a bias of walk density K
     takes steps of K / sqrt(rate) from sample to sample.
 
     Args:
-        motion: of the IMU's frame.
+        motion: motion of the IMU frame.
         model: the unit.
-        duration_s: s.
-        seed: of biases and noise; a longer recording begins with the same numbers.
+        duration_s: length of the recording, s.
+        seed: seed of biases and noise; a longer recording begins with the same numbers.
         start_ns: absolute time of the motion's time 0, ns.
 
     Raises:
@@ -123,7 +123,7 @@ def simulate_imu(
     """
     _check(model, duration_s)
     count = math.floor(duration_s * model.rate + 1e-6) + 1
-    # times are whole nanoseconds first, so that a sample is exact at its stamp
+    # times are rounded to nanoseconds first, so that a sample is exact at its stamp
     offset_ns = np.round(np.arange(count) * (1e9 / model.rate)).astype(np.int64)
     readings = np.empty((4, count, 3))
     start_key, noise_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), 2))
@@ -150,7 +150,7 @@ def simulate_imu(
 
 
 class _Unit(eqx.Module):
-    """The model's numbers per sample, gyroscope first, accelerometer second."""
+    """The model's numbers for one sample; the gyroscope comes first, the accelerometer second."""
 
     white: Float[Array, "2"]
     step: Float[Array, "2"]
@@ -166,7 +166,7 @@ def _samples(
     bias: Float[Array, "2 3"],
     key: PRNGKeyArray,
 ) -> tuple[Float[Array, "2 n 3"], Float[Array, "2 n 3"], Float[Array, "2 3"]]:
-    """Return readings and biases of a chunk, and the bias with which the next one starts."""
+    """Return readings and biases of a chunk, and the bias with which the next chunk starts."""
 
     def ideal(time: Float[Array, ""]) -> Float[Array, "2 3"]:
         kinematics = kinematics_at(motion, time)

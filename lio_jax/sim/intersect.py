@@ -1,4 +1,4 @@
-"""Where rays meet the shapes of a world, and the surface's normal there."""
+"""Where rays meet the shapes of a world, and the normal of the surface there."""
 
 from typing import Any, NamedTuple
 
@@ -10,17 +10,17 @@ from lio_jax.sim.primitives import Boxes, Cylinders, Grounds, Planes, Spheres, T
 from lio_jax.sim.worlds import MovingBoxes
 
 TINY = 1e-12
-"""Stands in for a zero direction component: 1/TINY stays finite in float32."""
+"""Replaces a zero component of a direction: 1/TINY stays finite in float32."""
 
 _GROUND_STEPS = 20
-"""At 16, one ray in 15,000 over the worlds' grounds was not yet down at 130 m; at 20, none."""
+"""Number of steps: with 16, one ray in 15,000 had not reached a ground at 130 m; with 20, every ray had."""
 
 _GROUND_END = 300.0
 """Beyond this distance no ray meets a ground, m."""
 
 
 class Rays(NamedTuple):
-    """Origins and unit directions, one array per coordinate: the layout that vectorises."""
+    """Origins (m) and unit directions: one array for each coordinate, the layout that vectorises best."""
 
     x: Float[Array, "*n"]
     y: Float[Array, "*n"]
@@ -29,7 +29,7 @@ class Rays(NamedTuple):
     dy: Float[Array, "*n"]
     dz: Float[Array, "*n"]
     time: Float[Array, "*n"]
-    """s since the instant at which the movers were placed."""
+    """Time since the instant at which the moving boxes were placed, s."""
 
 
 def plane_distance(plane: Any, rays: Rays) -> Float[Array, "*n"]:
@@ -44,9 +44,9 @@ def plane_distance(plane: Any, rays: Rays) -> Float[Array, "*n"]:
 def ground_distance(ground: Any, rays: Rays) -> Float[Array, "*n"]:
     """Return the distance to one height field (a row of Grounds).
 
-    With F the ray's height above ground and c >= |F''| along it, nothing is met before
-    F + F' s - c s^2 / 2 falls to zero: steps of that s never jump over the first crossing and converge to it
-    quadratically. A ray that only grazes the ground may run out of steps and counts as a miss.
+    With F the ray's height above ground and c >= |F''| along it, the ray meets nothing before
+    F + F' s - c s^2 / 2 falls to zero. Steps of that s never pass the first crossing, and they converge to it
+    quadratically. A ray that only grazes the ground may use up its steps; it counts as a miss.
     """
     waves = [
         (
@@ -77,7 +77,7 @@ def ground_distance(ground: Any, rays: Rays) -> Float[Array, "*n"]:
         return jnp.minimum(distance + jnp.where(rate < 0, falling, rising), _GROUND_END)
 
     distance = jax.lax.fori_loop(0, _GROUND_STEPS, advance, begin)
-    # what a coordinate of that size is rounded to, some ten times over
+    # about ten times the rounding error of a coordinate of that size
     tolerance = 10 * jnp.finfo(begin.dtype).eps * (10 + distance)
     reached = (jnp.abs(above(distance)[0]) < tolerance) & (distance > 0) & (distance < _GROUND_END)
     return jnp.where(reached, distance, jnp.inf)
@@ -110,7 +110,7 @@ def tilted_distance(box: Any, rays: Rays) -> Float[Array, "*n"]:
 
 
 def moving_distance(moving: Any, rays: Rays) -> Float[Array, "*n"]:
-    """Return the distance to one moving box (a row of MovingBoxes) where it is when each ray is sent."""
+    """Return the distance to one moving box (a row of MovingBoxes) at its place when each ray is sent."""
     return box_distance(
         moving.boxes,
         rays._replace(
@@ -141,7 +141,7 @@ def cylinder_distance(cylinder: Any, rays: Rays) -> Float[Array, "*n"]:
 
 
 def sphere_distance(sphere: Any, rays: Rays) -> Float[Array, "*n"]:
-    """Return the distance to one ball (a row of Spheres); the discriminant from the closest approach."""
+    """Return the distance to one ball (a row of Spheres), by the ray's closest approach to its centre."""
     x, y, z = sphere.center[0] - rays.x, sphere.center[1] - rays.y, sphere.center[2] - rays.z
     along = x * rays.dx + y * rays.dy + z * rays.dz
     aside = (x - along * rays.dx) ** 2 + (y - along * rays.dy) ** 2 + (z - along * rays.dz) ** 2
@@ -156,7 +156,7 @@ def _away_from_zero(value: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def _sin_cos(angle: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Return both, to 2e-14 for angles of some tens of radians: on a CPU ten times as fast as jnp.sin."""
+    """Return sine and cosine to 2e-14 for angles up to some tens of rad, on a CPU 10 times as fast as jnp."""
     quarter = jnp.round(angle * (2 / jnp.pi))
     # pi/2 in three parts (Cody and Waite): small multiples of the first two are exact in float32
     rest = ((angle - quarter * 1.5703125) - quarter * 4.8351287841796875e-4) - quarter * 3.139164786504813e-7
@@ -189,14 +189,14 @@ def _first_of_interval(*intervals: tuple[Float[Array, "*n"], Float[Array, "*n"]]
 
 
 def plane_normal(planes: Planes, point: Float[Array, "n 3"], time: Float[Array, " n"]) -> Float[Array, "n 3"]:
-    """Return the planes' own normals."""
+    """Return the planes' normals, which are the same at every point."""
     return planes.normal
 
 
 def ground_normal(
     grounds: Grounds, point: Float[Array, "n 3"], time: Float[Array, " n"]
 ) -> Float[Array, "n 3"]:
-    """Return the upward normals."""
+    """Return the upward normals of the grounds at the points."""
     angle = grounds.wave[..., 0] * point[:, :1] + grounds.wave[..., 1] * point[:, 1:2] + grounds.phase
     slope = jnp.sum((grounds.amplitude * jnp.cos(angle))[..., None] * grounds.wave, axis=1)
     upward = jnp.concatenate([-slope, jnp.ones_like(slope[:, :1])], axis=1)
@@ -231,7 +231,7 @@ def moving_normal(
 def cylinder_normal(
     cylinders: Cylinders, point: Float[Array, "n 3"], time: Float[Array, " n"]
 ) -> Float[Array, "n 3"]:
-    """Return the outward normals of wall or cap, whichever is nearer."""
+    """Return the outward normals of the side or of a cap, of the surface that is nearer to the point."""
     offset = point - cylinders.base
     radial = offset.at[:, 2].set(0)
     length = jnp.linalg.norm(radial, axis=1)
@@ -244,7 +244,7 @@ def cylinder_normal(
 def sphere_normal(
     spheres: Spheres, point: Float[Array, "n 3"], time: Float[Array, " n"]
 ) -> Float[Array, "n 3"]:
-    """Return the outward normals."""
+    """Return the outward normals of the balls at the points."""
     outward = point - spheres.center
     return outward / jnp.maximum(jnp.linalg.norm(outward, axis=1, keepdims=True), TINY)
 

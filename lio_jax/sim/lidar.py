@@ -1,7 +1,7 @@
 """One sweep of a LiDAR: every ray is cast from the pose that the sensor has at the ray's own firing time.
 
-Directions, poses and ranges are float64 (call it in JAX's x64 mode, ``jax.enable_x64``): where a ray only
-grazes a surface, the last digit of a float32 in its direction is a millimetre of its range.
+Directions, poses and ranges are float64 (call it in JAX's x64 mode, ``jax.enable_x64``). Where a ray only
+grazes a surface, an error in the last digit of a float32 direction is an error of a millimetre in range.
 """
 
 from abc import abstractmethod
@@ -21,7 +21,7 @@ _LN2 = 0.6931472
 
 
 class Ranging(eqx.Module):
-    """How a sensor measures distance, whatever its pattern."""
+    """How a sensor measures distance, independent of its scan pattern."""
 
     sigma: Float[Array, ""]
     """Standard deviation of a range, m."""
@@ -30,10 +30,10 @@ class Ranging(eqx.Module):
     maximum: Float[Array, ""]
     """Farthest range that is reported, m."""
     half_range: Float[Array, ""]
-    """Where a white surface met head-on answers every second time, m; inf for a sensor that misses nothing.
+    """Range at which a white surface, met head-on, answers every second ray, m; inf: no ray is missed.
 
     The chance of an answer is 1 - 2^-s with s = reflectivity * cos(incidence) * (half_range / range)^2, which
-    is proportional to the light that comes back: dark, slanted and far surfaces drop out.
+    is proportional to the light that comes back: dark, slanted and far surfaces answer less often.
     """
 
 
@@ -45,15 +45,15 @@ def ranging(
 
 
 class Lidar(eqx.Module):
-    """A sensor that fires column after column, the beams of a column one shortly after another."""
+    """A sensor that fires column after column; the beams of a column fire shortly one after another."""
 
     ranging: Ranging
     columns: int = eqx.field(static=True)
-    """Firings of each beam in a sweep."""
+    """Number of columns in a sweep: how often each beam fires."""
     period_ns: int = eqx.field(static=True)
     """Duration of a sweep, ns."""
     delay_ns: tuple[int, ...] = eqx.field(static=True)
-    """Of each beam after its column's time, ns, in firing order; the last is over before the next column."""
+    """Delay of each beam after its column's time, ns, in firing order; all end before the next column."""
     ring: tuple[int, ...] = eqx.field(static=True)
     """Number of each beam as the sensor's driver reports it, in firing order."""
 
@@ -69,10 +69,10 @@ class Lidar(eqx.Module):
 
     @abstractmethod
     def phase(self, start_ns: int) -> Float[Array, "2"]:
-        """Return what :meth:`directions` needs to know of a sweep's start, (2,) turns.
+        """Return the scan pattern's state at a sweep's start, as :meth:`directions` needs it, (2,) turns.
 
         Args:
-            start_ns: of the sweep since the sensor was switched on, ns.
+            start_ns: start of the sweep since the sensor was switched on, ns.
         """
 
     @abstractmethod
@@ -81,23 +81,23 @@ class Lidar(eqx.Module):
 
 
 class SpinningLidar(Lidar):
-    """A head that turns clockwise seen from above, each sweep one turn from straight behind."""
+    """A head that turns clockwise seen from above; each sweep is one turn that starts straight behind."""
 
     elevation: tuple[float, ...] = eqx.field(static=True)
-    """Above the sensor's xy plane, in firing order, rad."""
+    """Elevation of each beam above the sensor's xy plane, in firing order, rad."""
     azimuth: tuple[float, ...] = eqx.field(static=True)
-    """Ahead of the head's own direction, counter-clockwise, in firing order, rad."""
+    """Azimuth of each beam relative to the head's direction, counter-clockwise, in firing order, rad."""
 
     def phase(self, start_ns: int) -> Float[Array, "2"]:
-        """Return zeros: every turn is alike."""
+        """Return zeros: all turns have the same pattern."""
         return jnp.zeros(2)
 
     def directions(self, phase: Float[Array, "2"]) -> Float[Array, "columns beams 3"]:
-        """Return the unit directions: the head turns on between the beams of a column, too."""
+        """Return the unit directions; the head also turns between the beams of a column."""
         head = np.pi - 2 * np.pi * column_times_ns(self) / self.period_ns
         beam = np.array(self.azimuth) - 2 * np.pi * np.array(self.delay_ns) / self.period_ns
         level, up = np.cos(self.elevation), np.sin(self.elevation)
-        # by the angle sum, so that only column and beam are constants of a compiled program, not every ray
+        # by the angle sum, so that the compiled program's constants are columns and beams, not every ray
         cos, sin = (jnp.asarray(part)[:, None] for part in (np.cos(head), np.sin(head)))
         east, north = jnp.asarray(np.cos(beam) * level), jnp.asarray(np.sin(beam) * level)
         x, y = cos * east - sin * north, sin * east + cos * north
@@ -108,11 +108,11 @@ class Sweep(eqx.Module):
     """One sweep, column by column in firing order, misses included."""
 
     points: Float[Array, "columns beams 3"]
-    """Lidar frame at each ray's own firing time, m."""
+    """Points in the lidar frame at each ray's own firing time, m."""
     intensity: Float[Array, "columns beams"]
     """Reflectivity times the cosine of incidence, 0 to 255 in whole steps."""
     mask: Bool[Array, "columns beams"]
-    """True where something within the range limits answered."""
+    """True where the ray was answered within the range limits."""
 
 
 def spinning_lidar(
@@ -125,16 +125,16 @@ def spinning_lidar(
     min_range: float = 0.5,
     max_range: float = 100.0,
 ) -> SpinningLidar:
-    """Return an ideal sensor: beams evenly spread and fired at once, no dropouts.
+    """Return an ideal sensor: beams evenly spread and fired at once, no missing answers.
 
     Args:
-        beams: numbered from the lowest.
-        columns: firings a turn.
+        beams: number of beams, counted from the lowest.
+        columns: columns in a turn.
         rate: turns per second.
-        elevation_deg: of the lowest and the highest beam.
+        elevation_deg: elevation of the lowest and of the highest beam, deg.
         range_sigma: standard deviation of a range, m.
-        min_range: m.
-        max_range: m.
+        min_range: nearest range that is reported, m.
+        max_range: farthest range that is reported, m.
     """
     elevation = np.deg2rad(np.linspace(elevation_deg[0], elevation_deg[1], beams))
     return SpinningLidar(
@@ -164,9 +164,9 @@ def firing_times_ns(lidar: Lidar) -> NDArray[np.int64]:
 
 
 def outer_sum(of_column: NDArray[np.float64], of_beam: NDArray[np.float64]) -> Float[Array, "columns beams"]:
-    """Return the sum of a quantity of the column and one of the beam.
+    """Return the sum of a quantity of each column and a quantity of each beam.
 
-    Only the two summands become constants of a compiled program, not one number a ray.
+    Only the two summands become constants of a compiled program, not one number for each ray.
     """
     return jnp.asarray(of_column)[:, None] + jnp.asarray(of_beam)
 
@@ -182,13 +182,13 @@ def sweep(
 
     Args:
         lidar: the sensor.
-        part: of a world, placed at the sweep's start, near the origin.
+        part: the part of a world around the lidar, placed at the sweep's start, near the origin.
         T_world_column: lidar pose at each column's time, batch (columns,).
-        key: of this sweep's noise.
-        phase: from ``lidar.phase``; None for a sensor whose sweeps are all alike.
+        key: key of this sweep's noise.
+        phase: result of ``lidar.phase``; None for a sensor whose sweeps all have the same pattern.
 
     Returns:
-        The sweep's points in the frame that the lidar had when each was measured.
+        The sweep's points in the lidar frame at each ray's firing time.
     """
     directions = lidar.directions(jnp.zeros(2) if phase is None else phase)
     shape = directions.shape[:2]
@@ -198,7 +198,7 @@ def sweep(
     model = lidar.ranging
     cosine = -jnp.sum(hit.normal * rays, axis=1)
     answer = hit.reflectivity * cosine
-    # 1 - 2^-s, by comparing an exponential draw with s: nothing is divided by a zero range or cosine
+    # 1 - 2^-s, by comparing an exponential draw with s: this never divides by a zero range or cosine
     draw = jax.random.exponential(jax.random.fold_in(key, 1), answer.shape, jnp.float32) / _LN2
     answered = draw * (hit.distance / model.half_range) ** 2 <= answer
     mask = (hit.distance >= model.minimum) & (hit.distance <= model.maximum) & answered
@@ -215,9 +215,9 @@ def sweep(
 def _rays(
     lidar: Lidar, T_world_column: jaxlie.SE3, directions: Float[Array, "columns beams 3"]
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
-    """Return origins and directions in the world.
+    """Return origins (m) and unit directions of the rays in the world.
 
-    Within a column the pose goes on linearly to the next column's: over h = 100 us this is off by
+    Within a column the pose moves linearly towards the next column's pose. Over h = 100 us the error is
     h^2/8 = 1.3e-9 s^2 times the acceleration, less than 1e-7 m.
     """
     rotation = T_world_column.rotation().as_matrix()
@@ -235,6 +235,6 @@ def _turned(
 
 
 def _step(values: Float[Array, "columns ..."]) -> Float[Array, "columns ..."]:
-    # the last column has no next one: it goes on as the one before it did
+    # the last column has no next one: its step is that of the column before
     steps = jnp.diff(values, axis=0)
     return jnp.concatenate([steps, steps[-1:]])

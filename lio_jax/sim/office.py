@@ -10,9 +10,9 @@ from lio_jax.sim.traffic import Loop, traffic
 from lio_jax.sim.worlds import Route, Scene
 
 HALF_THICKNESS = 0.06
-"""Of a wall, m."""
+"""Half the thickness of a wall, m."""
 DOOR_HEIGHT = 2.1
-"""m."""
+"""Height of a door opening, m."""
 
 
 def wall(
@@ -25,11 +25,11 @@ def wall(
     """Return the box rows of a wall along x or y.
 
     Args:
-        begin: one end, of the lower coordinates, m.
-        end: the other, m.
-        heights: of foot and top, m.
+        begin: the end with the lower coordinates, m.
+        end: the other end, m.
+        heights: heights of foot and top, m.
         reflectivity: 0 to 1.
-        doors: distance of each opening's middle from ``begin`` and its width, in order, m.
+        doors: for each opening in order: distance of its middle from ``begin`` and its width, m.
     """
     axis = 0 if end[0] != begin[0] else 1
     across = 1 - axis
@@ -40,7 +40,7 @@ def wall(
         (low - HALF_THICKNESS, high + HALF_THICKNESS, heights[0] + DOOR_HEIGHT)
         for low, high in zip(edges[1:-1:2], edges[2:-1:2], strict=True)
     ]
-    # walls reach into what they meet, lintels into their piers, so that no ray slips through
+    # walls reach into the walls they meet, and lintels into their piers, so that no ray passes between them
     piers[0] = (-HALF_THICKNESS, *piers[0][1:])
     piers[-1] = (piers[-1][0], length + HALF_THICKNESS, heights[0])
     rows = []
@@ -55,22 +55,22 @@ def wall(
 def open_leaf(
     hinge: tuple[float, float], heading: float, width: float, foot: float, reflectivity: float
 ) -> NDArray[np.float64]:
-    """Return the box row of a door leaf that stands off its hinge towards ``heading`` (rad)."""
+    """Return the box row of a door leaf that points from its hinge towards ``heading`` (rad)."""
     x = hinge[0] + np.cos(heading) * width / 2
     y = hinge[1] + np.sin(heading) * width / 2
     return np.array([[x, y, foot + DOOR_HEIGHT / 2, width / 2, 0.02, DOOR_HEIGHT / 2, heading, reflectivity]])
 
 
 _WIDTH, _LENGTH = 24.0, 12.0
-"""Of the block of rooms inside the ring, m; its low corner is the builder's origin."""
+"""Size of the block of rooms inside the ring corridor, m; its low corner is the builder's origin."""
 _CORRIDOR, _DEPTH = 2.0, 5.0
 """Width of the corridor and depth of the rooms outside it, m."""
 _HALL = (8.0, 16.0)
 """Where the big hall inside the ring begins and ends along x, m."""
 _LANES = (10.0, 13.6)
-"""Where the walk goes through the hall's double doors, m along x."""
+"""Where the walk passes the hall's double doors, m along x."""
 _TURN = 3.0
-"""Where it goes from one to the other, m along y."""
+"""Where the walk goes from one lane to the other, m along y."""
 _HEIGHTS = (0.0, 2.8)
 _HAND = 1.4
 """Height at which the sensor is carried, m."""
@@ -112,7 +112,7 @@ def _route() -> NDArray[np.float64]:
 
 
 def _inner(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return walls and furniture of the hall and of the four rooms beside it."""
+    """Return walls and furniture of the hall and of the four rooms next to it."""
     west, east = _HALL
     half = _LENGTH / 2
     double = 1.5

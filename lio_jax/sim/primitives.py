@@ -1,40 +1,40 @@
-"""The shapes a world is made of, many of a kind in one pytree of arrays."""
+"""The shapes of a world: each class holds many shapes of one kind in one pytree of arrays."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
 
 class Planes(eqx.Module):
-    """Infinite planes."""
+    """Planes without boundary."""
 
     point: Float[Array, "n 3"]
-    """Any point of the plane, m."""
+    """Any point of the plane, world frame, m."""
     normal: Float[Array, "n 3"]
-    """Unit normal."""
+    """Unit normal, world frame."""
     reflectivity: Float[Array, " n"]
     """Share of the light that comes back at normal incidence, 0 to 1."""
 
     def moved(self, by: Float[Array, "3"]) -> "Planes":
-        """Return them displaced."""
+        """Return the planes displaced by ``by`` (m)."""
         return Planes(self.point + by, self.normal, self.reflectivity)
 
 
 class Grounds(eqx.Module):
-    """Height fields without end: z = height + sum of amplitude sin(wave . (x, y) + phase)."""
+    """Height fields without boundary: z = height + sum of amplitude sin(wave . (x, y) + phase)."""
 
     height: Float[Array, " n"]
-    """Mean, m."""
+    """Mean height, m."""
     amplitude: Float[Array, "n waves"]
-    """Positive, m."""
+    """Amplitude of each wave, positive, m."""
     wave: Float[Array, "n waves 2"]
     """Wave vectors, rad/m."""
     phase: Float[Array, "n waves"]
-    """rad."""
+    """Phase of each wave at the origin, rad."""
     reflectivity: Float[Array, " n"]
     """Share of the light that comes back at normal incidence, 0 to 1."""
 
     def moved(self, by: Float[Array, "3"]) -> "Grounds":
-        """Return them displaced."""
+        """Return the height fields displaced by ``by`` (m)."""
         phase = self.phase - self.wave[..., 0] * by[0] - self.wave[..., 1] * by[1]
         return Grounds(self.height + by[2], self.amplitude, self.wave, phase, self.reflectivity)
 
@@ -43,7 +43,7 @@ class Boxes(eqx.Module):
     """Upright boxes, turned about the vertical."""
 
     center: Float[Array, "n 3"]
-    """m."""
+    """Centre of each box, world frame, m."""
     half_size: Float[Array, "n 3"]
     """Half the edge lengths along the box's own axes, m."""
     yaw: Float[Array, " n"]
@@ -52,7 +52,7 @@ class Boxes(eqx.Module):
     """Share of the light that comes back at normal incidence, 0 to 1."""
 
     def moved(self, by: Float[Array, "3"]) -> "Boxes":
-        """Return them displaced."""
+        """Return the boxes displaced by ``by`` (m)."""
         return Boxes(self.center + by, self.half_size, self.yaw, self.reflectivity)
 
 
@@ -60,7 +60,7 @@ class TiltedBoxes(eqx.Module):
     """Boxes in any attitude."""
 
     center: Float[Array, "n 3"]
-    """m."""
+    """Centre of each box, world frame, m."""
     half_size: Float[Array, "n 3"]
     """Half the edge lengths along the box's own axes, m."""
     rotation: Float[Array, "n 3 3"]
@@ -69,7 +69,7 @@ class TiltedBoxes(eqx.Module):
     """Share of the light that comes back at normal incidence, 0 to 1."""
 
     def moved(self, by: Float[Array, "3"]) -> "TiltedBoxes":
-        """Return them displaced."""
+        """Return the boxes displaced by ``by`` (m)."""
         return TiltedBoxes(self.center + by, self.half_size, self.rotation, self.reflectivity)
 
 
@@ -77,29 +77,29 @@ class Cylinders(eqx.Module):
     """Upright solid cylinders."""
 
     base: Float[Array, "n 3"]
-    """Centre of the lower cap, m."""
+    """Centre of the lower cap, world frame, m."""
     radius: Float[Array, " n"]
-    """m."""
+    """Radius of each cylinder, m."""
     height: Float[Array, " n"]
-    """m."""
+    """Height of each cylinder, m."""
     reflectivity: Float[Array, " n"]
     """Share of the light that comes back at normal incidence, 0 to 1."""
 
     def moved(self, by: Float[Array, "3"]) -> "Cylinders":
-        """Return them displaced."""
+        """Return the cylinders displaced by ``by`` (m)."""
         return Cylinders(self.base + by, self.radius, self.height, self.reflectivity)
 
 
 class Spheres(eqx.Module):
-    """Balls, such as the crowns of trees."""
+    """Balls, for example the crowns of trees."""
 
     center: Float[Array, "n 3"]
-    """m."""
+    """Centre of each ball, world frame, m."""
     radius: Float[Array, " n"]
-    """m."""
+    """Radius of each ball, m."""
     reflectivity: Float[Array, " n"]
     """Share of the light that comes back at normal incidence, 0 to 1."""
 
     def moved(self, by: Float[Array, "3"]) -> "Spheres":
-        """Return them displaced."""
+        """Return the balls displaced by ``by`` (m)."""
         return Spheres(self.center + by, self.radius, self.reflectivity)

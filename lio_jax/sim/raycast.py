@@ -1,4 +1,4 @@
-"""Cast rays into a world."""
+"""Cast rays into a world: search in float32 among slightly grown solids, then measure in full precision."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
@@ -28,15 +28,76 @@ from lio_jax.sim.intersect import (
 from lio_jax.sim.primitives import Boxes, Cylinders, Grounds, Planes, Spheres, TiltedBoxes
 from lio_jax.sim.worlds import MovingBoxes, Part
 
+
+class Hit(eqx.Module):
+    """What each ray meets first."""
+
+    distance: Float[Array, " n"]
+    """Distance along the unit direction, m; inf where the ray meets nothing."""
+    normal: Float[Array, "n 3"]
+    """Unit normal of the surface, on the side of the ray's origin; zero where the ray meets nothing."""
+    reflectivity: Float[Array, " n"]
+    """Reflectivity of the surface, 0 to 1; zero where the ray meets nothing."""
+
+
+def cast(
+    part: Part, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], time: Float[Array, " n"]
+) -> Hit:
+    """Return the first hit of each ray.
+
+    Distances are as exact as the rays' precision allows, even where a ray grazes or barely misses a surface.
+
+    Args:
+        part: part of a world, of the same dtype as the rays.
+        origins: (n, 3) m, in the part's frame.
+        directions: (n, 3) unit vectors in the part's frame.
+        time: (n,) s, when each ray is sent, counted from the part's instant.
+
+    Returns:
+        Distance, surface normal and reflectivity per ray.
+    """
+    x, y, z = origins.T
+    dx, dy, dz = directions.T
+    rays = Rays(x, y, z, dx, dy, dz, time)
+    kinds = _kinds(part)
+    if not kinds:
+        nothing = jnp.zeros_like(rays.x)
+        return Hit(nothing + jnp.inf, jnp.zeros_like(directions), nothing)
+    distance, number = first_met(kinds, rays)
+    first, best = jnp.argmin(distance, axis=0), jnp.min(distance, axis=0)
+    normal, reflectivity = jnp.zeros_like(directions), jnp.zeros_like(best)
+    for place, kind in enumerate(kinds):
+        seen = (first == place) & jnp.isfinite(best)
+
+        def surface(
+            normal: Array,
+            reflectivity: Array,
+            kind: Kind = kind,
+            which: Array = number[place],
+            seen: Array = seen,
+        ) -> tuple[Array, Array]:
+            met = jax.tree.map(lambda leaf: leaf[which], kind.rows)
+            point = origins + jnp.where(seen, best, 0)[:, None] * directions
+            own = kind.normal(met, point, time)
+            return jnp.where(seen[:, None], own, normal), jnp.where(seen, met.reflectivity, reflectivity)
+
+        # the branch also keeps XLA from fusing all kinds into one pass, which computes each kind many times
+        normal, reflectivity = jax.lax.cond(
+            jnp.any(seen), surface, lambda *unchanged: unchanged, normal, reflectivity
+        )
+    away = jnp.sum(normal * directions, axis=1) > 0
+    return Hit(best, jnp.where(away[:, None], -normal, normal), reflectivity)
+
+
 _SHARE = 2.0**-19
-"""Of a coordinate's size: sixteen times what float32 rounds it by, for the sums and products of a few."""
+"""Margin as a share of a coordinate's size: 16 float32 rounding errors, enough for a few operations."""
 
 _Box = TypeVar("_Box", Boxes, TiltedBoxes)
 _Endless = TypeVar("_Endless", Planes, Grounds)
 
 
 def endless_grown(surfaces: _Endless, reach: Float[Array, ""]) -> _Endless:
-    """Return planes and grounds as they are: they have no outline to miss."""
+    """Return planes and grounds as they are: they have no edge that a rounded ray could miss."""
     return surfaces
 
 
@@ -72,61 +133,63 @@ def _margin(
 
 
 _TOGETHER = 8
-"""Solids whose distances are held in memory at once."""
+"""Number of solids whose distances are held in memory at once."""
 _SMALL = 2**16
-"""Up to so many pairs of a solid and a ray, all of them are looked at in full precision."""
+"""Up to this number of pairs of a solid and a ray, all distances are computed in full precision."""
 _AGAIN = 256
-"""Rays that are searched for again at once."""
+"""Number of rays in one round of the second search."""
 
 _Tree = TypeVar("_Tree")
 
 
 class Kind(NamedTuple):
-    """All solids of a kind and what to do with them."""
+    """All solids of one kind, and the functions that work on them."""
 
     rows: Any
+    """The solids, one in each row of a pytree of arrays."""
     distance: Callable[..., Array]
-    """From one solid and rays, as in ``intersect``."""
+    """Function of one solid and rays that returns distances, for example ``intersect.box_distance``."""
     normal: Callable[..., Array]
-    """From one solid and one point on it per row, as in ``normals``."""
+    """Function of solids, points and times that returns normals, for example ``intersect.box_normal``."""
     grown: Callable[..., Any]
-    """From all solids and how far from the origin rays start, as in ``growth``."""
+    """Function of all solids and the rays' largest distance from the origin, for example ``box_grown``."""
 
     @property
     def size(self) -> int:
-        """How many there are."""
+        """Number of solids."""
         return int(self.rows.reflectivity.shape[0])
 
 
 class _Nearest(NamedTuple):
     distance: Float[Array, " n"]
-    """To the solid that is met first, m; inf where none is."""
+    """Distance to the solid that the ray meets first, m; inf where it meets none."""
     number: Int[Array, " n"]
-    """Which one that is."""
+    """Row of the solid that the ray meets first."""
     following: Float[Array, " n"]
-    """At what distance another may be met, m; float32."""
+    """Distance at which the ray may meet another solid, m; float32."""
 
 
 def first_met(kinds: list[Kind], rays: Rays) -> tuple[Float[Array, "kinds n"], Int[Array, "kinds n"]]:
-    """Return how far each ray goes until it meets one of each kind, and which one.
+    """Return, for each kind, the distance at which each ray first meets a solid, and that solid's row.
 
-    The distance is in m, and inf where none is met.
+    The distance is in m, and inf where the ray meets none.
 
-    Many rays are searched for in float32, among solids grown by its rounding. That yields a candidate of each
-    kind, whose distance then follows in full precision, and at what distance the ray may meet another of the
-    kind. The few rays that may do so before they have met any candidate are searched for once more.
+    Where rays and solids are many, the search runs in float32 among solids that are grown by its rounding
+    error. It yields one candidate of each kind, and the distance at which the ray may meet another solid of
+    that kind. The candidate's distance is then computed in full precision. The few rays that may meet another
+    solid before any candidate are searched a second time.
     """
     found = [_candidate(kind, rays) for kind in kinds]
     distance, number, following = (jnp.stack(part) for part in zip(*found, strict=True))
     if all(_is_small(kind, rays) for kind in kinds):
         return distance, number
-    # the barrier keeps XLA from computing it anew for each of its uses
+    # the barrier keeps XLA from computing the distance again for each of its uses
     distance = jax.lax.optimization_barrier(distance)
     unsure = jnp.any(following < jnp.min(distance, axis=0), axis=0)
 
     def search_again(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         unsure, distance, number = state
-        # what there are too few of is filled up with the first ray
+        # where fewer rays than a round takes are left, the round is filled with the first ray
         rows = jnp.nonzero(unsure, size=_AGAIN, fill_value=0)[0]
         few = jax.tree.map(lambda leaf: leaf[rows], rays)
         found = [
@@ -157,18 +220,19 @@ def _candidate(kind: Kind, rays: Rays) -> _Nearest:
 
 
 def _nearest_of_all(kind: Kind, rays: Rays) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
-    """Return distance and number in full precision; needs memory for each solid and ray."""
+    """Return distance and row in full precision; needs memory for each pair of a solid and a ray."""
     to_each = jax.lax.map(lambda solid: kind.distance(solid, rays), kind.rows)
     return jnp.min(to_each, axis=0), jnp.argmin(to_each, axis=0).astype(jnp.int32)
 
 
 def _nearest(solids: Any, rays: Rays, distance_to: Callable[..., Array]) -> _Nearest:
-    """Search all solids, a few at once.
+    """Search all solids, a few at a time.
 
-    The inner loop puts their distances into memory: fused, XLA computes each anew for each of three results.
+    The inner loop stores their distances in memory: XLA would otherwise fuse the loops and compute each
+    distance again for each of the three results.
     """
     count = solids.reflectivity.shape[0]
-    # what fills up the last block is left out below
+    # the rows that fill up the last block are left out below
     fill = jnp.minimum(jnp.arange(-(-count // _TOGETHER) * _TOGETHER), count - 1)
     blocks = jax.tree.map(lambda leaf: leaf[fill].reshape(-1, _TOGETHER, *leaf.shape[1:]), solids)
 
@@ -194,66 +258,6 @@ def _nearest(solids: Any, rays: Rays, distance_to: Callable[..., Array]) -> _Nea
 
 def _single(tree: _Tree) -> _Tree:
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf, tree)
-
-
-class Hit(eqx.Module):
-    """What each ray met first."""
-
-    distance: Float[Array, " n"]
-    """m along the unit direction; inf where nothing was met."""
-    normal: Float[Array, "n 3"]
-    """Unit surface normal that faces the ray's origin; zero where nothing was met."""
-    reflectivity: Float[Array, " n"]
-    """Of the surface; zero where nothing was met."""
-
-
-def cast(
-    part: Part, origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], time: Float[Array, " n"]
-) -> Hit:
-    """Return the first hit of each ray.
-
-    Distances are as exact as the rays' precision allows, however flat a surface is met or closely missed.
-
-    Args:
-        part: of a world, of the same dtype as the rays.
-        origins: in the part's frame, m.
-        directions: unit vectors in the part's frame.
-        time: when each ray is sent, s since the part's instant.
-
-    Returns:
-        Distance, surface normal and reflectivity per ray.
-    """
-    x, y, z = origins.T
-    dx, dy, dz = directions.T
-    rays = Rays(x, y, z, dx, dy, dz, time)
-    kinds = _kinds(part)
-    if not kinds:
-        nothing = jnp.zeros_like(rays.x)
-        return Hit(nothing + jnp.inf, jnp.zeros_like(directions), nothing)
-    distance, number = first_met(kinds, rays)
-    first, best = jnp.argmin(distance, axis=0), jnp.min(distance, axis=0)
-    normal, reflectivity = jnp.zeros_like(directions), jnp.zeros_like(best)
-    for place, kind in enumerate(kinds):
-        seen = (first == place) & jnp.isfinite(best)
-
-        def surface(
-            normal: Array,
-            reflectivity: Array,
-            kind: Kind = kind,
-            which: Array = number[place],
-            seen: Array = seen,
-        ) -> tuple[Array, Array]:
-            met = jax.tree.map(lambda leaf: leaf[which], kind.rows)
-            point = origins + jnp.where(seen, best, 0)[:, None] * directions
-            own = kind.normal(met, point, time)
-            return jnp.where(seen[:, None], own, normal), jnp.where(seen, met.reflectivity, reflectivity)
-
-        # the branch also keeps XLA from fusing all kinds into one pass, which computes each many times over
-        normal, reflectivity = jax.lax.cond(
-            jnp.any(seen), surface, lambda *unchanged: unchanged, normal, reflectivity
-        )
-    away = jnp.sum(normal * directions, axis=1) > 0
-    return Hit(best, jnp.where(away[:, None], -normal, normal), reflectivity)
 
 
 def _kinds(part: Part) -> list[Kind]:

@@ -6,17 +6,17 @@ from lio_jax.sim.assembly import assembled, upright
 from lio_jax.sim.worlds import Route, Scene
 
 SIZE = np.array([12.0, 8.0, 3.5])
-"""Of the room, m; the builder's frame has its origin at the floor's centre."""
+"""Size of the room along x, y and z, m; the builder's frame has its origin at the floor's centre."""
 PILLAR = (0.0, 0.0, 0.4)
-"""x, y and radius, m; from floor to ceiling."""
+"""Position x, y and radius of the pillar, m; it reaches from floor to ceiling."""
 BALL = (4.9, 2.9, 0.6, 0.5)
-"""Centre and radius, m."""
+"""Centre x, y, z and radius of the ball, m."""
 START = np.array([-1.0, -2.2, 1.4])
-"""Of the route, m."""
+"""Start of the route, m."""
 
 
 def room(seed: int) -> Scene:
-    """Return the room and a walk around its pillar; ``seed`` sets the reflectivities alone."""
+    """Return the room and a walk around its pillar; ``seed`` changes the reflectivities only."""
     reflectivity = np.random.default_rng(seed).uniform(0.2, 0.9, 3)
     half = SIZE / 2
     world = assembled(

@@ -1,4 +1,4 @@
-"""A route's polyline to the control points of a smooth path: corners rounded and slowed down for."""
+"""Turn a route's polyline into the control points of a smooth path that slows down at corners."""
 
 import math
 from typing import Literal, NamedTuple
@@ -11,22 +11,22 @@ from lio_jax.core.errors import UsageError
 from lio_jax.sim.worlds import Route
 
 _KNOTS_PER_RADIUS = 5.0
-"""Knots spent on a radius' length of a corner: the spline cuts the corner by 1 % of the radius."""
+"""Number of knots per radius of arc length in a corner: the spline cuts the corner by 1 % of the radius."""
 _WIDEST = 8.0
-"""A gentle bend is rounded by up to this many times the route's radius."""
+"""A gentle bend is rounded with a radius up to this many times the route's radius."""
 
 
 class TimedPath(NamedTuple):
-    """Control points that are passed at a constant rate."""
+    """Control points and the constant rate at which they are passed."""
 
     control: NDArray[np.float64]
-    """(n, 3) m; an open path has two more before its start and three more behind its end."""
+    """Control points, (n, 3) m; an open path has two more before its start and three more behind its end."""
     knot_rate: float
-    """Control points passed per second at full speed."""
+    """Number of control points passed in a second at full speed."""
 
 
 def timed_path(route: Route, lateral: float, braking: float) -> TimedPath:
-    """Round the corners of a route and space control points by the speed that suits each place.
+    """Round the corners of a route and space the control points by the speed that suits each place.
 
     Args:
         route: the polyline.
@@ -53,7 +53,7 @@ def timed_path(route: Route, lateral: float, braking: float) -> TimedPath:
     bend = np.maximum(np.interp(places, along, curvature), lateral / route.speed**2)
     wanted = np.sqrt(lateral / bend)
     corner_speed = min(route.speed, math.sqrt(lateral * route.radius))
-    # slow down ahead of a corner and speed up behind it over the distance that braking gently takes
+    # the distance of gentle braking: the body slows down over it before a corner and speeds up over it after
     reach = max((route.speed**2 - corner_speed**2) / (2 * braking), route.radius / 2)
     speed = _eased(wanted, reach / (places[1] - places[0]), "wrap" if route.closed else "nearest")
     knot_rate = _KNOTS_PER_RADIUS * corner_speed / route.radius
@@ -67,7 +67,7 @@ def timed_path(route: Route, lateral: float, braking: float) -> TimedPath:
 
 
 def extended(control: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mirror two rows before the first and three behind the last, so that the spline meets both."""
+    """Mirror two rows before the first and three behind the last, so that the spline meets both ends."""
     before = 2 * control[0] - control[2:0:-1]
     after = 2 * control[-1] - control[-2:-5:-1]
     return np.concatenate([before, control, after])
@@ -97,7 +97,7 @@ def _checked(route: Route) -> NDArray[np.float64]:
 def _rounded(
     points: NDArray[np.float64], closed: bool, radius: float, step: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return samples about ``step`` m apart, and the curvature of the path at each, 1/m."""
+    """Return samples (m) about ``step`` m apart, and the curvature of the path at each sample, 1/m."""
     count = len(points)
     path: list[NDArray[np.float64]] = [] if closed else [points[:1]]
     bends: list[NDArray[np.float64]] = [] if closed else [np.zeros(1)]
@@ -131,7 +131,7 @@ def _corner(
         return corner[None], 0.0
     if turn > math.radians(170):
         raise UsageError(f"route.points: the route turns back on itself at point {index}; go around instead.")
-    # gentle bends wider, so that a change of slope is not taken for a street corner
+    # gentle bends get a wider radius: a change of slope must not slow the body down as a street corner does
     wide = radius * min(_WIDEST, max(1.0, math.sin(math.pi / 4) / math.sin(turn / 2)))
     fitting = min(wide, 0.5 * min(lengths) / math.tan(turn / 2))
     angles = np.linspace(0, turn, max(2, math.ceil(fitting * turn / step)))[:, None]
@@ -150,7 +150,7 @@ def _join(
 
 
 def _eased(speed: NDArray[np.float64], reach: float, mode: Literal["wrap", "nearest"]) -> NDArray[np.float64]:
-    """Lower the speed within ``reach`` samples of slower places, smoothly, never above the wanted speed."""
+    """Lower the speed smoothly within ``reach`` samples of slower places, never above the wanted speed."""
     half = max(1, round(reach / 2))
     window = np.hanning(2 * half + 3)[1:-1]
     lowest = minimum_filter1d(speed, 2 * half + 1, mode=mode)

@@ -1,4 +1,4 @@
-"""Models of scanning LiDAR sensors: beams, timing and ranges."""
+"""Models of scanning LiDAR sensors: beams, timing and range limits."""
 
 import math
 from collections.abc import Callable
@@ -23,27 +23,27 @@ from lio_jax.sim.lidar import (
 )
 
 _MILLIHERTZ_NS = 1_000_000_000_000
-"""ns in which a thousandth of a turn per second makes one turn."""
+"""Time that a rotation of 0.001 turns per second takes for one turn, ns."""
 
 
 class RosetteLidar(Lidar):
-    """A sensor that looks along +x through two prisms; its beams are lines, fanned out vertically."""
+    """A sensor that looks along +x through two rotating prisms; its beams are lines in a vertical fan."""
 
     prism_mhz: tuple[int, int] = eqx.field(static=True)
-    """Turns of the prisms in 1000 s, counter-clockwise seen along +x."""
+    """Turns of each prism in 1000 s, counter-clockwise seen along +x."""
     radius: float = eqx.field(static=True)
-    """Half the angle of the field of view, of one line, rad."""
+    """Half the angle of the field of view of one line, rad."""
     fan: tuple[float, ...] = eqx.field(static=True)
     """Upward tilt of each line, in firing order, rad."""
 
     def phase(self, start_ns: int) -> Float[Array, "2"]:
-        """Return how far each prism has turned beyond whole turns, (2,) turns."""
-        # the start in Python's unbounded integers: exact however long the recording
+        """Return the fraction of a turn by which each prism has turned beyond whole turns, (2,) turns."""
+        # Python's unbounded integers keep the start exact in recordings of any length
         turned = [start_ns * rate % _MILLIHERTZ_NS / _MILLIHERTZ_NS for rate in self.prism_mhz]
         return jnp.array(turned)
 
     def directions(self, phase: Float[Array, "2"]) -> Float[Array, "columns beams 3"]:
-        """Return the unit directions: the angles measured from +x, towards +y and +z."""
+        """Return the unit directions; the angles are measured from +x, towards +y and +z."""
         columns, delays = column_times_ns(self), np.array(self.delay_ns)
         first, second = (
             2 * jnp.pi * (phase[number] + outer_sum(_turns(columns, rate), _turns(delays, rate)))
@@ -61,37 +61,42 @@ def _turns(times_ns: NDArray[np.int64], rate_mhz: int) -> NDArray[np.float64]:
 
 
 Layout = Literal["velodyne", "ouster", "livox"]
-"""Whose driver's message a bag holds the scans in."""
+"""The make of LiDAR whose driver's message type a bag uses for the scans."""
 
 _TURN_NS = 100_000_000
-"""All sensors sweep at 10 Hz."""
+"""Duration of a sweep, ns: all sensors sweep at 10 Hz."""
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor that can be asked for by name."""
+    """A sensor that a user can choose by name."""
 
     build: Callable[[], Lidar]
+    """Function that returns the sensor's model."""
     layout: Layout
+    """The make of LiDAR whose driver's message type a bag uses for the scans."""
     description: str
+    """What the list of sensors shows for it."""
 
 
 def vlp16() -> SpinningLidar:
-    """Return a VLP-16: 2 deg apart, fired 2.304 us apart in interleaved order, rings from the lowest."""
+    """Return a VLP-16: beams 2 deg apart, fired every 2.304 us, interleaved, rings from the lowest."""
     upper, lower = np.arange(1.0, 16.0, 2.0), np.arange(-15.0, 0.0, 2.0)
     elevation = np.stack([lower, upper], axis=1).ravel()
     return _spinning(elevation, 1800, 2304 * np.arange(16), ranging(0.02, 0.5, 100.0, 250.0))
 
 
 def hdl32() -> SpinningLidar:
-    """Return an HDL-32E: 4/3 deg apart, fired 1.152 us apart in interleaved order, rings from the lowest."""
+    """Return an HDL-32E: beams 4/3 deg apart, fired every 1.152 us, interleaved, rings from the lowest."""
     ascending = (np.arange(32) * 4 - 92) / 3
     elevation = np.stack([ascending[:16], ascending[16:]], axis=1).ravel()
     return _spinning(elevation, 2170, 1152 * np.arange(32), ranging(0.02, 1.0, 100.0, 250.0))
 
 
 def hdl64() -> SpinningLidar:
-    """Return an HDL-64E: 1/3 deg apart above, 1/2 deg below, one beam of each block at a time.
+    """Return an HDL-64E: beams 1/3 deg apart in the upper block and 1/2 deg in the lower.
+
+    One beam of each block fires at a time.
 
     Rings count from the highest beam, as in KITTI and A-LOAM.
     """
@@ -108,12 +113,12 @@ def os1_64() -> SpinningLidar:
 
 
 def os1_128() -> SpinningLidar:
-    """Return an OS1-128: as the OS1-64, with twice the beams."""
+    """Return an OS1-128: an OS1-64 with twice the beams."""
     return _ouster(128)
 
 
 def livox() -> RosetteLidar:
-    """Return an Avia-like sensor: 70.4 x 77.2 deg, six lines, 240,000 rays a second, never the same sweep.
+    """Return an Avia-like sensor: 70.4 x 77.2 deg, six lines, 240,000 rays a second, no repeated sweep.
 
     The prisms' rates are a choice of this package (no published ones were found): 100 s without repetition.
     """

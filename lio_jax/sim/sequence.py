@@ -1,4 +1,4 @@
-"""A simulated recording as a Sequence: scans are ray cast when they are asked for."""
+"""A simulated recording as a Sequence: each scan is ray cast when it is asked for."""
 
 import math
 from collections.abc import Iterator
@@ -32,15 +32,15 @@ EPOCH_NS = 1_700_000_000_000_000_000
 _TRUTH_STEP_NS = 10_000_000
 _POSES_AT_ONCE = 4096
 _STANDSTILL = 1.5
-"""Before pulling away unless asked otherwise, s."""
+"""Default time at rest before the body moves off, s."""
 _DURATION = 10.0
-"""Unless asked otherwise, s."""
+"""Default duration of a recording, s."""
 
 
 class SimulatedSequence:
     """A drive, walk or flight through a simulated world with exact truth.
 
-    A scan depends on the arguments and its number only, not on which scans were asked for before.
+    A scan depends on the arguments and its number only, not on the scans that were asked for before.
     """
 
     def __init__(
@@ -64,20 +64,20 @@ class SimulatedSequence:
         Args:
             world: a name of ``world_registry.WORLDS``.
             sensor: a name of ``sensors.SENSORS``, or a sensor.
-            duration_s: of the recording, s; whole sweeps only. None: the whole ``trajectory``, or 10 s.
-            seed: of world, motion and noise.
-            beams: of the sensor "generic32"; None: 32.
-            columns: firings per turn of the sensor "generic32"; None: 1024.
+            duration_s: length of the recording, s, in whole sweeps. None: the whole ``trajectory``, or 10 s.
+            seed: seed of world, motion and noise.
+            beams: number of beams of the sensor "generic32"; None: 32.
+            columns: columns in a turn of the sensor "generic32"; None: 1024.
             imu: the inertial sensor; None: the recording has none.
             gps: the GPS receiver; None: the recording has none.
-            standstill_s: time at rest at the start of the world's route, s; None: 1.5, or 0 if moving.
+            standstill_s: time at rest at the route's start, s; None: 1.5, or 0 with a moving start.
             moving_start: whether the recording starts at full speed on the world's route.
-            trajectory: T_world_imu to pass through instead of the world's route, from its first pose on.
+            trajectory: T_world_imu to follow, from its first pose on, instead of the world's route.
             T_imu_lidar: (4, 4) pose of the lidar in the IMU frame; None: a small lever arm and rotation.
 
         Raises:
-            UsageError: an unknown world or sensor, an impossible duration or extrinsic, or a motion that runs
-                into something.
+            UsageError: an unknown world or sensor, an impossible duration or extrinsic, or a motion that
+                meets a surface.
         """
         scene = build(world, seed)
         self.lidar, self.lidar_layout, description = _sensor(sensor, beams, columns)
@@ -106,7 +106,7 @@ class SimulatedSequence:
             self.motion = motion_through(trajectory)
         self._seed, self._imu_model, self._gps_model = seed, imu, gps
         extrinsic = _extrinsic(T_imu_lidar)
-        # the motion is in double precision whatever the caller's setting: truth is truth
+        # the motion is in double precision in every mode of JAX, because it is the truth
         with jax.enable_x64(True):
             wxyz = Rotation.from_matrix(extrinsic[:3, :3]).as_quat(scalar_first=True)
             self._T_imu_lidar = jaxlie.SE3(jnp.asarray(np.concatenate([wxyz, extrinsic[:3, 3]])))
@@ -154,7 +154,7 @@ class SimulatedSequence:
         return Trajectory(EPOCH_NS + offsets, self.poses(offsets * 1e-9))
 
     def truth_arrays(self) -> dict[str, NDArray[Any]]:
-        """Return what an estimator may want to know besides the poses, by name.
+        """Return the true quantities besides the poses, by name.
 
         ``T_imu_lidar`` (4, 4), ``range_sigma`` (m), ``gravity`` (3,) in world (m/s^2), and with an IMU its
         true biases, noise densities and time offset as :class:`~lio_jax.sim.imu.ImuTruth` names them.
@@ -176,7 +176,7 @@ class SimulatedSequence:
         times = np.asarray(times, np.float64)
         found = []
         with jax.enable_x64(True):
-            # in pieces of one shape: one compiled program, and no more memory for an hour than for a minute
+            # pieces of one shape need one compiled program, and an hour needs no more memory than a minute
             for start in range(0, len(times), _POSES_AT_ONCE):
                 piece = times[start : start + _POSES_AT_ONCE]
                 padded = np.pad(piece, (0, _POSES_AT_ONCE - len(piece)), mode="edge")
@@ -210,12 +210,12 @@ class SimulatedSequence:
         )
 
     def _counts_in_range(self, positions: NDArray[np.float64]) -> Counts:
-        """Return how many solids of each kind the sensor can have in range at once, anywhere on its way."""
-        # as many as the collision check counts at: one compiled program
+        """Return the largest numbers of solids of each kind in the sensor's range, anywhere on its way."""
+        # the same number of positions as in the collision check: one compiled program serves both
         sampled = positions[::TOGETHER]
         driven = np.linalg.norm(np.diff(sampled, axis=0, append=positions[-1:]), axis=1).max()
         lever = np.linalg.norm(np.asarray(self.info.T_imu_lidar)[:3, 3])
-        # what is driven between the samples, and within a sweep that starts at one
+        # the body's way between the checked positions, and during a sweep that starts at one of them
         margin = 2 * driven + lever + 1.0
         radius = float(self.lidar.ranging.maximum + margin)
         with jax.enable_x64(True):
@@ -237,7 +237,7 @@ def _sensor(sensor: str | Lidar, beams: int | None, columns: int | None) -> tupl
 
 
 def _rounded_up(count: int) -> int:
-    """Return up to 14 % more, so that most seeds and durations of a world share one compiled program."""
+    """Return ``count`` raised by up to 14 %, so that most seeds and durations share one compiled program."""
     step = max(1, 2 ** (count.bit_length() - 4))
     return -(-count // step) * step
 
@@ -247,7 +247,7 @@ def _span(trajectory: Trajectory) -> float:
 
 
 def _extrinsic(T_imu_lidar: NDArray[np.floating[Any]] | None) -> NDArray[np.float64]:
-    """Return the (4, 4) pose as given, or the default."""
+    """Return the (4, 4) extrinsic as given, or the default."""
     if T_imu_lidar is None:
         default = np.eye(4)
         default[:3, :3] = Rotation.from_euler("xyz", [0.6, -1.2, 2.5], degrees=True).as_matrix()
@@ -278,9 +278,9 @@ def _surroundings(
     lidar: Lidar,
     counts: Counts,
 ) -> tuple[Part, jaxlie.SE3]:
-    """Return what is in range and the lidar poses at the columns' times.
+    """Return the solids in range and the lidar poses at the columns' times.
 
-    Both are relative to where the lidar is at the sweep's start, as rays are cast best near the origin.
+    Both are relative to the lidar's position at the sweep's start, because rays are exact near the origin.
     """
     times = start + jnp.asarray(column_times(lidar))
     poses = jax.vmap(lambda time: pose_at(motion, time) @ T_imu_lidar)(times)

@@ -1,4 +1,4 @@
-"""A staircase between four floors: two flights and a half-landing a storey, with a lobby on each floor."""
+"""A staircase between four floors: two flights and a half-landing for each storey, a lobby on each floor."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,23 +8,23 @@ from lio_jax.sim.worlds import Route, Scene
 
 _STOREYS = 3
 _STOREY = 3.4
-"""From floor to floor, m."""
+"""Height from floor to floor, m."""
 _STEPS, _TREAD = 10, 0.3
-"""Steps of a flight and the depth of each, m."""
+"""Number of steps of a flight, and depth of each step, m."""
 _RUN, _RISE = _STEPS * _TREAD, _STOREY / 2 / _STEPS
 _FLIGHT, _SPINE = 1.5, 0.3
-"""Width of a flight and of the wall between the two, m."""
+"""Width of a flight, and of the wall between the two flights, m."""
 _LANDING = 1.8
 """Depth of the half-landing, m."""
 _LOBBY = (6.0, 4.0)
-"""Depth and half the width of a lobby, m."""
+"""Depth of a lobby, and half its width, m."""
 _SLAB = 0.25
 _LAP = 0.05
-"""How far neighbouring boxes reach into each other, so that no ray slips through between them, m."""
+"""Overlap of neighbouring boxes, so that no ray passes between them, m."""
 _HAND = 1.35
-"""Height at which the sensor is carried above the tread, m."""
+"""Height of the sensor above the tread, m."""
 _SIDE, _LANE = _FLIGHT + _SPINE / 2, (_FLIGHT + _SPINE) / 2
-"""From the stairwell's middle to its wall and to the middle of a flight, m."""
+"""Distance from the stairwell's middle to its wall, and to the middle of a flight, m."""
 _TOP = _STOREYS * _STOREY + 2.9
 _TURN = -1.2
 """Where the walk crosses from one flight to the next in front of the stairs, m along x."""
@@ -32,10 +32,10 @@ _PAINT, _STONE = 0.7, 0.4
 
 
 def stairs(seed: int) -> Scene:
-    """Return the staircase and a walk up to the highest lobby and down again; ``seed`` sets the furniture.
+    """Return the staircase and a walk up to the highest lobby and down again; ``seed`` changes the furniture.
 
-    The builder's frame: flights along x from 0 to the half-landing, the first at y < 0 and the second, back,
-    at y > 0; the lobbies at x < 0.
+    The builder's frame: flights run along x from 0 to the half-landing. The first flight is at y < 0, the
+    second, which leads back, at y > 0. The lobbies are at x < 0.
     """
     rng = np.random.default_rng(seed)
     route = _route()
@@ -62,7 +62,7 @@ def _hull() -> NDArray[np.float64]:
                 floors + np.array([_LAP, half + 1, 0]),
                 _STONE,
             ),
-            # a parapet where no further flight goes up
+            # a parapet closes the floor where no further flight goes up
             upright([-0.1, -_SIDE, _STOREYS * _STOREY], [0, 0, _STOREYS * _STOREY + 1], _PAINT),
         ]
     )
@@ -90,7 +90,7 @@ def _flights(floor: float) -> NDArray[np.float64]:
 
 
 def _furniture(floor: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return cupboards along the lobby's walls, other ones on every floor."""
+    """Return cupboards along the lobby's walls; they differ from floor to floor."""
     depth, half = _LOBBY
     middle = -depth / 2 + rng.uniform(-1.5, 1.5, 3)
     length, height = rng.uniform(0.4, 1.2, 3), rng.uniform(0.5, 2.2, 3)
@@ -113,7 +113,7 @@ def _furniture(floor: float, rng: np.random.Generator) -> NDArray[np.float64]:
 
 def _route() -> NDArray[np.float64]:
     turn = _RUN + 1.0
-    # the walk's slope joins the treads' middles
+    # the walk's slope joins the middles of the treads
     half_tread = _TREAD / 2
     climb: list[list[float]] = []
     for storey in range(_STOREYS):
@@ -121,7 +121,7 @@ def _route() -> NDArray[np.float64]:
         climb += [[_TURN, -_LANE, floor], [-half_tread, -_LANE, floor], [_RUN - half_tread, -_LANE, half]]
         climb += [[turn, -_LANE, half], [turn, _LANE, half], [_RUN + half_tread, _LANE, half]]
         climb += [[half_tread, _LANE, floor + _STOREY], [_TURN, _LANE, floor + _STOREY]]
-    # the walk enters and leaves the stairs without the turn to another flight
+    # at its ends the walk enters and leaves the stairs without crossing to another flight
     climb, top = climb[1:-1], _STOREYS * _STOREY
     above = [[-4.5, _LANE, top], [-4.5, -2.5, top], [_TURN, -2.5, top], [_TURN, _LANE, top]]
     below = [[_TURN, -_LANE, 0], [_TURN, 2.5, 0], [-4.8, 2.5, 0], [-4.8, -_LANE, 0]]

@@ -1,4 +1,4 @@
-"""A procedurally built quarter: houses along streets and side streets, poles, trees and parked cars."""
+"""A random city quarter: houses along streets and side streets, poles, trees and parked cars."""
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +10,11 @@ from lio_jax.sim.blocks import Sides, block_sides, lap
 from lio_jax.sim.worlds import Route, Scene
 
 _BODY_HEIGHT = 1.5
-"""Of the body frame above the ground at rest, m."""
+"""Height of the body frame above the ground at rest, m."""
 
 
 def street(seed: int) -> Scene:
-    """Return the quarter and a car's lap through it; ``seed`` sets the quarter but not the lap."""
+    """Return the quarter and a car's lap through it; ``seed`` changes the quarter but not the lap."""
     route = np.insert(lap(), 2, _BODY_HEIGHT, axis=1)
     sides = block_sides()
     keys = jax.random.split(jax.random.key(seed), 3)

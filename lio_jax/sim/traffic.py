@@ -1,4 +1,4 @@
-"""Bodies that drive or walk round and round: their paths, and the boxes they are made of."""
+"""Bodies that drive or walk on closed loops: their paths, and the boxes that form them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,20 +9,25 @@ from numpy.typing import NDArray
 from lio_jax.sim.assembly import Traffic
 
 _STEPS = 512
-"""Path points a lap."""
+"""Number of path points in a lap."""
 
 _Height = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
 class Loop:
-    """A rectangle driven clockwise with rounded corners, and how many bodies share it evenly."""
+    """A rectangle with rounded corners, driven clockwise by bodies that are evenly spaced in time."""
 
     low: tuple[float, float]
+    """Corner with the lowest x and y, m."""
     high: tuple[float, float]
+    """Corner with the highest x and y, m."""
     radius: float
+    """Radius of the rounded corners, m."""
     speed: float
+    """Speed of the bodies, m/s."""
     bodies: int
+    """Number of bodies on the loop."""
 
 
 def car_boxes(
@@ -47,10 +52,10 @@ def traffic(
     """Return the traffic on the loops.
 
     Args:
-        loops: closed paths.
-        height: of the ground at (n, 2) positions, m.
-        bodies: for each body, loop by loop, its box rows in its own frame.
-        rng: where on the loop the first body starts.
+        loops: the closed paths.
+        height: function that returns the ground's height at (n, 2) positions, m.
+        bodies: box rows of each body in its own frame, loop by loop.
+        rng: draws where on its loop the first body starts.
     """
     paths, yaws, periods = [], [], []
     for loop in loops:
@@ -67,12 +72,12 @@ def traffic(
 
 
 def _rounded_rectangle(loop: Loop) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return points at equal steps, headings and length of the loop, from its low corner up."""
+    """Return points (m) at equal steps, headings (rad) and length (m) of the loop, from its low corner up."""
     low, high = np.array(loop.low) + loop.radius, np.array(loop.high) - loop.radius
     straight = high - low
     arc = np.pi / 2 * loop.radius
     length = 2 * straight.sum() + 4 * arc
-    # the pieces in order: west side up, arc, north side, arc, ...; position within the piece decides
+    # the pieces in order: west side up, arc, north side, arc, ...; the position in a piece gives the point
     centers = np.array([[low[0], high[1]], high, [high[0], low[1]], low])
     begins = np.array([[low[0], low[1]], [low[0], high[1]], high, [high[0], low[1]]])
     headings = np.pi / 2 - np.pi / 2 * np.arange(4)

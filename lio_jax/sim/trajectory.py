@@ -24,16 +24,17 @@ _LARGEST_TURN = np.deg2rad(90)
 class PoseSpline(eqx.Module):
     """Polynomials of degree 5 between time stamps.
 
-    The quaternion is interpolated in its four numbers and normalised. Turning the world or the body acts on
-    those numbers as a rotation of 4-space, under which interpolation is equivariant: no axis is preferred.
+    The spline interpolates the quaternion's four numbers and then normalises them. A rotation of the world or
+    of the body acts on those numbers as a rotation of 4-space. Interpolation is equivariant under it: no axis
+    is preferred.
     """
 
     breaks: Float[Array, " n_plus_1"]
-    """Where the polynomials meet, s from the first pose."""
+    """Times at which the polynomials meet, s from the first pose."""
     coefficients: Float[Array, "n 6 7"]
-    """Descending powers of the time since the interval's start: quaternion wxyz, position x y z (m)."""
+    """Coefficients of descending powers of the time since the interval's start: quaternion wxyz, xyz (m)."""
     duration: Float[Array, ""]
-    """The motion is defined from 0 to this time, s."""
+    """End of the motion, which is defined from 0 to this time, s."""
 
     def pose(self, time: Float[Array, ""]) -> jaxlie.SE3:
         """Return T_world_imu at ``time`` s from the first pose."""
@@ -49,7 +50,7 @@ class PoseSpline(eqx.Module):
 
 
 def spline_through(trajectory: Trajectory) -> PoseSpline:
-    """Fit the spline that meets every pose; to be called in JAX's x64 mode.
+    """Fit the spline that meets every pose; call it in JAX's x64 mode.
 
     Raises:
         LioJaxError: fewer than six poses, time that does not ascend, numbers that are not finite, or a turn
@@ -65,7 +66,7 @@ def spline_through(trajectory: Trajectory) -> PoseSpline:
         index = int(np.argmin(np.isfinite(trajectory.poses).all(axis=(1, 2))))
         raise LioJaxError(f"trajectory: pose {index} holds numbers that are not finite; remove it.")
     wxyz = trajectory.quaternions[:, [3, 0, 1, 2]]
-    # q and -q are one rotation: take the nearer one, all along
+    # q and -q are the same rotation: each quaternion takes the sign nearest to the one before
     signs = np.where(np.sum(wxyz[1:] * wxyz[:-1], axis=1) < 0, -1.0, 1.0)
     wxyz = wxyz * np.concatenate([[1.0], np.cumprod(signs)])[:, None]
     turn = 2 * np.arccos(np.clip(np.sum(wxyz[1:] * wxyz[:-1], axis=1), -1, 1))
@@ -84,7 +85,7 @@ def spline_through(trajectory: Trajectory) -> PoseSpline:
 
 
 _SMOOTHSTEP_PEAK = 35 / 16
-"""Largest slope of the smoothstep."""
+"""Largest slope of the smoothstep function."""
 
 _QUINTIC = (
     np.array(
@@ -99,26 +100,26 @@ _QUINTIC = (
     )
     / 120
 )
-"""Uniform quintic B-spline: a control point's weight per row, ascending powers of the knot's fraction."""
+"""Uniform quintic B-spline: a control point's weight in each row, ascending powers of the knot's fraction."""
 
 
 class RouteMotion(eqx.Module):
-    """Along a route: standing first, then pulling away; lap after lap, or to the end and back."""
+    """Motion along a route: first at rest, then moving; lap after lap, or to the end and back."""
 
     control: Float[Array, "n 4"]
     """Control points x, y, z (world frame, m) and roll at full speed (rad); their spacing sets the speed."""
     sway: Sway
-    """Added to the path once it moves."""
+    """Sway that is added to the path once the body moves."""
     knot_rate: Float[Array, ""]
-    """Control points passed per second at full speed."""
+    """Number of control points passed in a second at full speed."""
     standstill: Float[Array, ""]
-    """When it pulls away, s; negative: it did so before time 0."""
+    """Time at which the body starts to move, s; negative: it started before time 0."""
     pull_away: Float[Array, ""]
     """Time from rest to full speed, s."""
     climb: Float[Array, ""]
     """1 where the body pitches with the slope of its path, 0 where it stays level."""
     duration: Float[Array, ""]
-    """The motion is meant for 0 to this time, s, though it never ends."""
+    """Intended length of the motion, from 0 to this time, s; the motion itself has no end."""
     closed: bool = eqx.field(static=True)
     """Whether the path is a loop."""
 
@@ -135,13 +136,13 @@ class RouteMotion(eqx.Module):
         return jaxlie.SE3(jnp.concatenate([quaternion, place[:3] + offset]))
 
     def _progress(self, time: Float[Array, ""]) -> tuple[Array, Array, Array]:
-        """Return the knots passed, the share of full speed, and the share to which it has set off."""
+        """Return the knots passed, the share of full speed, and the share of the start-up that is done."""
         elapsed = (time - self.standstill) / self.pull_away
         per_unit = self.knot_rate * self.pull_away
         moving = _smoothstep(elapsed)
         if self.closed:
             return per_unit * _smoothstep_integral(elapsed), moving, moving
-        # there and back, slowing to a stop at both ends; a way too short for full speed never reaches it
+        # there and back, with a stop at both ends; on a short route the body never reaches full speed
         cruise = (self.control.shape[0] - 6) / per_unit
         way = cruise + 1
         phase = jnp.mod(jnp.maximum(elapsed, 0), 2 * way)
@@ -159,7 +160,7 @@ class RouteMotion(eqx.Module):
             first = jnp.clip(jnp.floor(knots), 0, count - 6)
             index = first.astype(jnp.int32) + jnp.arange(6)
         fraction = knots - first
-        # Horner on static coefficients: a traced power has no derivative at 0
+        # Horner's scheme with static coefficients: a traced power has no derivative at 0
         coefficients = self.control[index].T @ jnp.asarray(_QUINTIC, self.control.dtype)
         value, slope = coefficients[:, 5], 5 * coefficients[:, 5]
         for order in range(4, -1, -1):
@@ -170,7 +171,7 @@ class RouteMotion(eqx.Module):
 
 
 Motion: TypeAlias = RouteMotion | PoseSpline
-"""Anything with a ``duration`` and a pose for every instant."""
+"""A motion: it has a ``duration`` and a pose for every instant."""
 
 
 class Kinematics(eqx.Module):
@@ -178,11 +179,11 @@ class Kinematics(eqx.Module):
 
     T_world_imu: jaxlie.SE3
     velocity: Float[Array, "3"]
-    """Of the IMU origin, in world, m/s."""
+    """Velocity of the IMU origin, world frame, m/s."""
     acceleration: Float[Array, "3"]
-    """Of the IMU origin, in world, without gravity, m/s^2."""
+    """Acceleration of the IMU origin without gravity, world frame, m/s^2."""
     angular_velocity: Float[Array, "3"]
-    """Of the body, in the IMU frame, rad/s."""
+    """Angular velocity of the body, IMU frame, rad/s."""
 
 
 def pose_at(motion: Motion, time: Float[Array, ""]) -> jaxlie.SE3:
@@ -198,7 +199,7 @@ def kinematics_at(motion: Motion, time: Float[Array, ""]) -> Kinematics:
         return jax.jvp(lambda t: pose_at(motion, t).wxyz_xyz, (instant,), (one,))
 
     (value, rate), (_, second) = jax.jvp(moving, (time,), (one,))
-    # of the unit quaternion q: omega = 2 q* dq/dt
+    # for the unit quaternion q: omega = 2 q* dq/dt
     turning = jaxlie.SO3(value[:4]).inverse().wxyz
     angular = 2 * jaxlie.SO3(turning).multiply(jaxlie.SO3(rate[:4])).wxyz[1:]
     return Kinematics(jaxlie.SE3(value), rate[4:], second[4:], angular)
@@ -216,18 +217,18 @@ def motion_along(
     """Return the motion of a body along a route.
 
     Args:
-        route: where to, how fast, and what kind of body.
-        duration_s: of the recording, s.
-        standstill_s: time at rest before it pulls away, s.
-        moving_start: whether it is at full speed at time 0, having pulled away from the route's start before.
-        seed: of the sway.
+        route: the path, the speed and the kind of body.
+        duration_s: length of the recording, s.
+        standstill_s: time at rest before the body moves off, s.
+        moving_start: whether the body already moves at full speed at time 0, after a start before time 0.
+        seed: seed of the sway.
         swing_rate: how fast a handheld body looks around, rad/s; 4 is as fast as a wrist can.
 
     Returns:
-        A float64 motion, whatever JAX's mode.
+        The motion in float64, in every mode of JAX.
 
     Raises:
-        UsageError: an impossible duration, standstill or swing rate, a route that cannot be followed.
+        UsageError: an impossible duration, standstill or swing rate, or a route that cannot be followed.
     """
     if not duration_s > 0:
         raise UsageError(f"a duration of {duration_s} s holds nothing; give more than 0 s.")
@@ -260,7 +261,7 @@ def motion_through(trajectory: Trajectory) -> PoseSpline:
     """Return the smooth motion that meets every pose of a trajectory; time 0 is its first stamp.
 
     Returns:
-        A float64 motion, whatever JAX's mode.
+        The motion in float64, in every mode of JAX.
 
     Raises:
         LioJaxError: the poses cannot be joined smoothly (see :func:`spline_through`).
@@ -291,6 +292,6 @@ def _smoothstep(x: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def _smoothstep_integral(x: Float[Array, ""]) -> Float[Array, ""]:
-    # from 0 to 1 the polynomial's integral, 1/2 at the end; then the full rate
+    # from 0 to 1 the polynomial's integral, which ends at 1/2; then slope 1
     ramp = jnp.clip(x, 0, 1)
     return ramp**5 * (7 + ramp * (-14 + ramp * (10 - 2.5 * ramp))) + jnp.maximum(x - 1, 0)

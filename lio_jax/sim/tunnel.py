@@ -1,7 +1,7 @@
 """A long smooth road tunnel between two built-up portals.
 
-Between the lining's first and last 60 m, which carry niches and lamps, every cross-section is the same: a
-sensor there that sees no further than about 100 m cannot tell how far along the axis it is.
+Every cross-section is the same between the lining's first and last 60 m, which have niches and lamps. There
+the position along the axis is not observable for a sensor with a range of less than about 100 m.
 """
 
 import numpy as np
@@ -11,11 +11,11 @@ from lio_jax.sim.assembly import assembled, draws, upright
 from lio_jax.sim.worlds import Route, Scene
 
 LENGTH = 560.0
-"""From portal to portal, m; the builder's frame has the tunnel along +x from 0, its axis at y = 0."""
+"""Length from portal to portal, m; in the builder's frame the tunnel runs along +x from 0, with y = 0."""
 FURNISHED = 60.0
-"""What carries niches and lamps behind each portal, m."""
+"""Length behind each portal that has niches and lamps, m."""
 _APPROACH = 70.0
-"""Open road before each portal, m."""
+"""Length of open road before each portal, m."""
 _HALF_WIDTH, _HEIGHT, _CHAMFER = 5.0, 6.5, 1.6
 _LANE = -1.75
 _BODY_HEIGHT = 1.6
@@ -23,14 +23,14 @@ _CONCRETE, _ASPHALT = 0.4, 0.15
 
 
 def tunnel(seed: int) -> Scene:
-    """Return the tunnel and a car's way through it; ``seed`` sets what is before the portals."""
+    """Return the tunnel and a car's way through it; ``seed`` changes the surroundings of the portals."""
     rng = np.random.default_rng(seed)
     start = np.array([-_APPROACH + 10, _LANE, _BODY_HEIGHT])
     boxes, cylinders, spheres = _lining(), np.zeros((0, 6)), np.zeros((0, 5))
     for portal in (0, 1):
         built, poles, crowns = _surroundings(rng)
         if portal == 1:
-            # turned half round, so that it faces the other way
+            # turned by half a turn, so that it faces the other way
             center = [LENGTH, 0.0]
             built[:, :2], poles[:, :2], crowns[:, :2] = (
                 center - rows[:, :2] for rows in (built, poles, crowns)
@@ -68,7 +68,7 @@ def _chamfers() -> NDArray[np.float64]:
         tilt = -side * np.pi / 4
         cos, sin = np.cos(tilt), np.sin(tilt)
         rotation = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
-        # the box's middle plane holds the edge, its lower face the slanted surface
+        # the box's middle plane contains the edge, its lower face is the slanted surface
         center = [LENGTH / 2, side * _HALF_WIDTH, _HEIGHT]
         rows.append([*center, *half, *rotation.ravel(), _CONCRETE])
     return np.array(rows)
@@ -77,7 +77,7 @@ def _chamfers() -> NDArray[np.float64]:
 def _surroundings(
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return what stands before the portal at x = 0 and just behind it: boxes, cylinders, spheres."""
+    """Return boxes, cylinders and spheres that stand before the portal at x = 0 and just behind it."""
     outer = _HALF_WIDTH + 1
     portal = [
         upright([0, outer - 0.1, -0.5], [2, 40, 11], _CONCRETE),

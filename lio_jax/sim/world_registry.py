@@ -21,11 +21,11 @@ WORLDS: dict[str, Callable[[int], Scene]] = {
     "street": street,
     "tunnel": tunnel,
 }
-"""Name to builder: ``builder(seed) -> Scene``."""
+"""Builders by name: ``builder(seed) -> Scene``."""
 
 
 def build(name: str, seed: int) -> Scene:
-    """Return the world ``name`` (see WORLDS) grown from ``seed``, with its route.
+    """Return the world ``name`` (see WORLDS) for the seed ``seed``, with its route.
 
     Raises:
         UsageError: there is no such world.

@@ -14,43 +14,43 @@ from lio_jax.sim.primitives import Boxes, Cylinders, Grounds, Planes, Spheres, T
 
 
 class Movers(eqx.Module):
-    """Bodies on closed paths, each made of a few upright boxes."""
+    """Bodies on closed paths; each consists of a few upright boxes."""
 
     path: Float[Array, "m k 3"]
-    """Where each body is at equal steps of its period, world frame, m."""
+    """Position of each body at equal steps of its period, world frame, m."""
     yaw: Float[Array, "m k"]
-    """Its heading there, rad."""
+    """Heading of each body at those positions, rad."""
     period: Float[Array, " m"]
     """Duration of a lap, s."""
     body: Int[Array, " n"]
     """Which body each box belongs to."""
     boxes: Boxes
-    """In the body's own frame (x forward, z up)."""
+    """Boxes in the body's own frame (x forward, z up)."""
 
 
 class MovingBoxes(eqx.Module):
-    """Boxes at an instant and their velocity: within a sweep they move uniformly, without turning."""
+    """Boxes at an instant and their velocity: within a sweep they move uniformly and do not turn."""
 
     boxes: Boxes
-    """At time zero."""
+    """Boxes at the instant."""
     velocity: Float[Array, "n 3"]
-    """m/s."""
+    """Velocity of each box, m/s."""
 
     @property
     def reflectivity(self) -> Float[Array, " n"]:
-        """Of the boxes, 0 to 1."""
+        """Reflectivity of the boxes, 0 to 1."""
         return self.boxes.reflectivity
 
     def moved(self, by: Float[Array, "3"]) -> "MovingBoxes":
-        """Return them displaced."""
+        """Return the boxes displaced by ``by`` (m)."""
         return MovingBoxes(self.boxes.moved(by), self.velocity)
 
 
 def moving_boxes(movers: Movers, time: Float[Array, ""]) -> MovingBoxes:
-    """Return where the boxes are at ``time`` (s) and how fast they move; between path points in a line."""
+    """Return the boxes at ``time`` (s) and their velocities, on straight lines between path points."""
     bodies, steps = movers.yaw.shape
     passed = jnp.mod(time / movers.period, 1.0) * steps
-    # a share that rounds up to a whole lap is the lap's start
+    # a share that rounds up to a whole lap is the start of the lap
     now = jnp.floor(passed).astype(jnp.int32) % steps
     ahead = (now + 1) % steps
     share = (passed - jnp.floor(passed))[:, None]
@@ -69,7 +69,7 @@ def moving_boxes(movers: Movers, time: Float[Array, ""]) -> MovingBoxes:
 
 
 class Solids(eqx.Module):
-    """Everything at rest; what a ray meets first is what counts, so solids may overlap."""
+    """All solids at rest; they may overlap, because only the first surface that a ray meets counts."""
 
     planes: Planes
     grounds: Grounds
@@ -80,21 +80,21 @@ class Solids(eqx.Module):
 
 
 class World(eqx.Module):
-    """Everything a ray can hit, in the world frame."""
+    """All that a ray can meet, in the world frame."""
 
     solids: Solids
     movers: Movers
 
 
 class Part(eqx.Module):
-    """What is near a position that is its origin, at an instant: what rays are cast into."""
+    """The solids near a position at an instant, in a frame with that position as origin, ready for rays."""
 
     solids: Solids
     moving: MovingBoxes
 
 
 class Counts(NamedTuple):
-    """How many solids of each kind that is culled."""
+    """Number of solids to keep of each kind that is culled."""
 
     boxes: int | Int[Array, ""]
     tilted: int | Int[Array, ""]
@@ -108,18 +108,18 @@ _Rows = TypeVar("_Rows", Boxes, TiltedBoxes, Cylinders, Spheres)
 def nearest_part(
     world: World, position: Float[Array, "3"], time: Float[Array, ""], counts: Counts
 ) -> tuple[Part, Float[Array, ""]]:
-    """Return planes, grounds, movers and the nearest other solids, moved so that ``position`` is the origin.
+    """Return planes, grounds, movers and the nearest other solids in a frame with ``position`` as origin.
 
-    Near the origin float32 tells best which solid a ray meets; leaving far solids out makes casting cheap.
+    Float32 separates solids best near the origin, and casting is cheap without the far solids.
 
     Args:
-        world: everything.
-        position: world frame, m; rays are stated relative to it.
+        world: all solids and movers.
+        position: (3,) m, world frame; rays are stated relative to it.
         time: where the movers are placed, s from the recording's start.
-        counts: numbers of solids kept, static.
+        counts: numbers of solids to keep, static.
 
     Returns:
-        The part, and the radius (m) around ``position`` within which nothing was left out.
+        The part, and the radius (m) around ``position`` within which no solid is left out.
     """
     gaps = _gaps(world, position)
     solids = world.solids
@@ -159,7 +159,7 @@ def _counts_along(world: World, positions: Float[Array, "n 3"], radius: Float[Ar
 
 
 def _gaps(world: World, position: Float[Array, "3"]) -> tuple[Float[Array, " n"], ...]:
-    """Return each culled kind's horizontal distances from ``position``, never more than the true ones."""
+    """Return horizontal distances (m) from ``position`` to each culled kind, never above the true ones."""
     solids = world.solids
 
     def level(centers: Float[Array, "n 3"]) -> Float[Array, " n"]:
@@ -180,22 +180,24 @@ def _nearest_rows(rows: _Rows, gap: Float[Array, " n"], count: int) -> tuple[_Ro
 
 
 Dynamics = Literal["car", "handheld", "drone"]
-"""How a body moves along its route: sets sway, vibration and how it looks around."""
+"""Kind of body: it sets sway, vibration and how the body looks around."""
 
 
 @dataclass(frozen=True)
 class Route:
-    """The path of the body (IMU) frame, as a polyline whose corners are rounded."""
+    """The path of the body (IMU) frame: a polyline whose corners are rounded."""
 
     points: NDArray[np.float64]
-    """(n, 3) vertices in driving order, world frame, m; the route starts at the first."""
+    """Vertices in driving order, (n, 3) m, world frame; the route starts at the first."""
     closed: bool
-    """Whether the last vertex is joined to the first, to be driven lap after lap; an open route is driven to
-    its end and back again, facing the same way."""
+    """Whether the last vertex is joined to the first, for laps without end.
+
+    An open route is driven to its end and back again; on the way back the body faces the same way.
+    """
     radius: float
-    """Of the rounded corners, m."""
+    """Radius of the rounded corners, m."""
     speed: float
-    """On straights, m/s."""
+    """Speed on straights, m/s."""
     dynamics: Dynamics
 
 

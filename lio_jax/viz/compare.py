@@ -1,4 +1,4 @@
-"""Several runs on one page: numbers, ways, errors and times, and what was set differently."""
+"""Compare several runs on one page: numbers, paths, errors, times, and the settings that differ."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ def write_comparison(folders: Sequence[Path], out: Path) -> None:
     """Write a page that compares the runs of several folders.
 
     Raises:
-        LioJaxError: a folder is none of a run, or a file of it is damaged.
+        LioJaxError: a folder is not a run's, or a file of it is damaged.
         UsageError: a folder is given twice.
     """
     if len({folder.resolve() for folder in folders}) < len(folders):
@@ -48,7 +48,7 @@ def comparison(runs: Sequence[RunRecord]) -> str:
 
 
 def _names(runs: Sequence[RunRecord]) -> list[str]:
-    """Return the folders' names, as much of their paths as tells them apart."""
+    """Return the folders' names, with as much of their paths as makes them unique."""
     parts = [run.folder.resolve().parts for run in runs]
     for length in range(1, max(map(len, parts)) + 1):
         names = ["/".join(part[-length:]) for part in parts]

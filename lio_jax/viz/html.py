@@ -1,14 +1,14 @@
-"""A page that stands alone: one style for every report, all text escaped, nothing fetched from anywhere.
+"""A self-contained page: one style for all reports, all text escaped, nothing loaded from elsewhere.
 
-It has no scripts. It reads on a phone, on paper, in a light and in a dark room. Colours are the style's
-variables ``--series-0`` to ``--series-7``, so a chart drawn once fits them all.
+It has no scripts. It is readable on a phone, on paper, and with light and dark colour schemes. Colours are
+the style's variables ``--series-0`` to ``--series-7``, so that one drawing fits all of them.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 
 SERIES = 8
-"""Number of colours that tell series apart; further ones begin anew."""
+"""Number of distinct colours of series; further series use them again from the first."""
 
 _STYLE = """
 :root { color-scheme: light dark; --paper: #fff; --ink: #1d2327; --soft: #5d6770; --line: #d5dbe0;
@@ -60,11 +60,11 @@ ul { padding-left: 1.2rem; margin: .25rem 0; } .bad { color: var(--bad); }
 
 
 def page(title: str, sections: Iterable[str]) -> str:
-    """Return a whole HTML document; sections are HTML of the functions below, the title plain text."""
+    """Return a whole HTML document; sections are HTML of the functions below, the title is plain text."""
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        # no icon is asked of the server, and nothing but this page's own data may be shown
+        # the browser asks the server for no icon, and only data of this page may be shown
         '<link rel="icon" href="data:,">'
         '<meta http-equiv="Content-Security-Policy" '
         "content=\"default-src 'none'; style-src 'unsafe-inline'; img-src data:\">"
@@ -75,13 +75,13 @@ def page(title: str, sections: Iterable[str]) -> str:
 
 
 def section(title: str, *parts: str) -> str:
-    """Return a titled section; nothing where all parts are empty."""
+    """Return a titled section; return "" if all parts are empty."""
     body = "\n".join(part for part in parts if part)
     return f"<section><h2>{escape(title)}</h2>\n{body}\n</section>" if body else ""
 
 
 def figures(*drawn: str) -> str:
-    """Lay figures out beside each other, as many as there is room for."""
+    """Place figures side by side, as many as the width allows."""
     body = "\n".join(figure for figure in drawn if figure)
     return f'<div class="figures">\n{body}\n</div>' if body else ""
 
@@ -89,14 +89,14 @@ def figures(*drawn: str) -> str:
 def figure(
     title: str, svg: str, caption: str = "", legend: Sequence[tuple[str, int]] = (), wide: bool = False
 ) -> str:
-    """Return a drawing under its title.
+    """Return a drawing with its title.
 
     Args:
         title: plain text.
         svg: the drawing, HTML.
-        caption: what one sees, plain text.
-        legend: names with the number of their colour.
-        wide: take the whole width.
+        caption: what the drawing shows, plain text.
+        legend: names, each with the number of its colour.
+        wide: whether it takes the whole width.
     """
     keys = "".join(
         f'<span style="--key: {series_colour(number)}">{escape(name)}</span>' for name, number in legend
@@ -115,18 +115,18 @@ def series_colour(number: int) -> str:
 
 
 def paragraph(text: str, soft: bool = False) -> str:
-    """Return a paragraph of plain text, nothing for none."""
+    """Return a paragraph of plain text; return "" for an empty text."""
     return f"<p{' class=soft' if soft else ''}>{escape(text)}</p>" if text else ""
 
 
 def bullets(sentences: Iterable[str], bad: bool = False) -> str:
-    """Return a list of plain sentences, nothing for none."""
+    """Return a list of plain sentences; return "" for none."""
     items = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences)
     return f"<ul{' class=bad' if bad else ''}>{items}</ul>" if items else ""
 
 
 def tiles(values: Mapping[str, str]) -> str:
-    """Return the few numbers that matter, each over its name."""
+    """Return the most important numbers, each above its name."""
     cells = "".join(
         f"<div><b>{escape(value)}</b><span>{escape(name)}</span></div>" for name, value in values.items()
     )
@@ -134,14 +134,14 @@ def tiles(values: Mapping[str, str]) -> str:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table of plain text; what begins with a number stands to the right."""
+    """Return a table of plain text; cells that begin with a number are aligned right."""
     head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
     body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in rows)
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def folded(title: str, text: str) -> str:
-    """Return long plain text that opens on a click, and is open on paper."""
+    """Return long plain text that opens on a click and is always open on paper."""
     return f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>" if text else ""
 
 

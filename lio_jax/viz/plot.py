@@ -21,21 +21,21 @@ if TYPE_CHECKING:
 
 _ESTIMATE = "tab:blue"
 _TRUTH = "tab:green"
-# Below these spans (m) an axis would show nothing but rounding noise.
+# Below these spans (m) an axis would show rounding noise only.
 _MIN_SPAN_M = 0.01
 
 
 def plot_trajectory(path_png: Path, estimate: Trajectory, truth: Trajectory | None, title: str) -> None:
-    """Draw the way from above, the height over time and, where truth is known, the error over time.
+    """Draw the path from above, the height over time and, where truth is known, the error over time.
 
-    The truth is laid into the estimate's world by the same alignment the absolute error uses. Truth that
-    shares no instant with the estimate is left out, and the picture says so.
+    The truth is aligned with the estimate's world in the same way as for the absolute error. Truth that
+    shares no instant with the estimate is left out; the picture then states this.
 
     Args:
-        path_png: file to write, whole or not at all.
+        path_png: file to write, complete or not at all.
         estimate: T_world_body, z up, at least one pose.
-        truth: of the same body frame, any world.
-        title: shown above.
+        truth: true poses of the same body frame, in any world.
+        title: title of the picture.
     """
     figure = _figure(12.0, 6.5)
     figure.suptitle(title)
@@ -73,11 +73,11 @@ def plot_trajectory(path_png: Path, estimate: Trajectory, truth: Trajectory | No
 
 
 def plot_timings(path_png: Path, stage_ms: Mapping[str, ArrayLike]) -> None:
-    """Draw each stage's time over the scans, and the median, 95th and 99th percentile of each.
+    """Draw each stage's time over the scans, and the median, 95th and 99th percentile of each stage.
 
     Args:
-        path_png: file to write, whole or not at all.
-        stage_ms: ms per scan, one array per stage; values that are not finite are left out.
+        path_png: file to write, complete or not at all.
+        stage_ms: time per scan, ms, one array for each stage; values that are not finite are left out.
     """
     values = {name: np.atleast_1d(np.asarray(times, np.float64)) for name, times in stage_ms.items()}
     values = {name: times for name, times in values.items() if np.isfinite(times).any()}
@@ -184,14 +184,14 @@ def plot_tuning(
     intervals: Mapping[str, tuple[float, float]],
     best: int,
 ) -> None:
-    """Draw the losses and, one panel each, the parameters over the evaluations.
+    """Draw losses and parameters over the evaluations, with one panel for each parameter.
 
     Args:
-        path_png: file to write, whole or not at all.
-        losses: (n,) by name.
+        path_png: file to write, complete or not at all.
+        losses: (n,) losses by name.
         parameters: (n,) values by name; positive ones are drawn on a log scale.
-        intervals: 95 % interval of the best value by name, where it is known.
-        best: which evaluation was taken.
+        intervals: 95 % interval of the best value by name, where known.
+        best: index of the evaluation that was taken.
     """
     panels = 1 + len(parameters)
     columns = min(3, panels)
@@ -221,31 +221,31 @@ def plot_tuning(
 
 
 class Noise(Protocol):
-    """What is drawn of one sensor."""
+    """The noise analysis of one sensor, as it is drawn."""
 
     @property
     def tau(self) -> NDArray[np.float64]:
-        """(k,) averaging times, s."""
+        """Averaging times, (k,) s."""
         ...
 
     @property
     def deviation(self) -> NDArray[np.float64]:
-        """(k, 3) Allan deviation of the axes."""
+        """Allan deviation of each axis, (k, 3), in the sensor's unit."""
         ...
 
     @property
     def combined(self) -> NoiseFit:
-        """Fit to the axes' mean variance."""
+        """Fit to the mean variance of the axes."""
         ...
 
 
 def plot_allan(path_png: Path, noises: Mapping[str, Noise], title: str) -> None:
-    """Draw each sensor's Allan deviation, the fit and the two densities where they are read.
+    """Draw each sensor's Allan deviation, the fit, and the two densities at the times where they are read.
 
     Args:
-        path_png: file to write, whole or not at all.
-        noises: by name and unit.
-        title: shown above.
+        path_png: file to write, complete or not at all.
+        noises: noise analyses by name and unit.
+        title: title of the picture.
     """
     figure = _figure(6.0 * len(noises), 5.0)
     figure.suptitle(title)

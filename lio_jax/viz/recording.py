@@ -1,4 +1,4 @@
-"""The one place that speaks to rerun: recordings and the layout of its viewer."""
+"""The only module that uses rerun: recordings, and the layout of its viewer."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
 
-# Blue to yellow in even steps of lightness, so that the order survives colour blindness and grey print.
+# Blue to yellow in even steps of lightness: the order is visible without colour vision and in grey print.
 _ANCHORS = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], np.float64)
 
 
@@ -38,17 +38,17 @@ def colour_by_height(height: NDArray[np.floating], low: float, high: float) -> N
 
 
 RAW, ADDED = "world/lidar/raw", "world/added"
-"""Entities that are there to be turned on: they lie over the compensated scan and over the map."""
+"""Entities that are hidden at first, because they cover the compensated scan and the map."""
 PLOTS = {
     "match": "metrics/match",
     "state": "metrics/state",
     "times": "metrics/times",
 }
-"""Views of scalars by name."""
+"""Views of scalars, by name."""
 
 
 def default_blueprint() -> "rrb.Blueprint":
-    """Return the layout of a run."""
+    """Return the layout of the viewer for a run."""
     import rerun.blueprint as rrb
 
     hidden = rrb.EntityBehavior(visible=False)
@@ -82,15 +82,15 @@ def default_blueprint() -> "rrb.Blueprint":
 _MAX_SCAN_POINTS = 5_000
 _MIN_SCAN_POINTS = 1_000
 CLOUD_BUDGET_BYTES = 150_000_000
-"""Of all scans' clouds: a long recording gets fewer points a scan, then clouds of every n-th scan only."""
+"""Bytes for all scans' clouds: longer recordings get fewer points a scan, then every n-th scan only."""
 BYTES_PER_POINT = 40
-"""Of a scan: compensated with its colour, raw, and features or what is new to the map."""
+"""Bytes per point of a scan: compensated with colour, raw, and features or points that are new in the map."""
 MAX_MAP_POINTS = 300_000
 _MAP_PIECES = 40
-"""The map appears in so many pieces: each stays from when it was seen."""
+"""Number of pieces of the map; each piece is shown from the time at which it was seen."""
 _PIECE_SCANS = 50
-"""Scans of a piece where their number is not known before."""
-# The whole strip is written anew each time it has grown by this share: its bytes stay linear in the run.
+"""Number of scans in a piece if the number of scans of the run is not known beforehand."""
+# The whole path is written again each time it has grown by this share: its bytes stay linear in the run.
 _STRIP_GROWTH = 1.03
 _STRIP_MIN_STEP = 10
 _ESTIMATE_COLOUR = (31, 119, 180)
@@ -98,13 +98,13 @@ _TRUTH_COLOUR = (44, 160, 44)
 _RAW_COLOUR, _ADDED_COLOUR = (150, 150, 150), (230, 80, 60)
 _CORNER_COLOUR, _SURFACE_COLOUR = (214, 39, 40), (23, 190, 207)
 SIGMA_SCALE = 100.0
-"""Position sigmas are centimetres: ellipsoids are drawn so many times larger."""
+"""Factor by which ellipsoids are enlarged: standard deviations of the position are centimetres."""
 _CORRECTED_COLOUR, _CLOSED_COLOUR, _REFUSED_COLOUR = (148, 103, 189), (44, 160, 44), (214, 39, 40)
 _ARROW_M = 5.0
 
 
 class Recording:
-    """A context manager that writes ``path`` aside and renames it when it ends without an exception.
+    """A context manager that writes a hidden file and renames it to ``path`` if no exception ends the block.
 
     Entities: world/lidar (pose), world/lidar/scan (compensated), world/lidar/raw, world/lidar/corners and
     surfaces, world/lidar/unobserved, world/imu (pose), world/imu/position_100_sigma, world/added,
@@ -117,9 +117,9 @@ class Recording:
         """Open the file.
 
         Args:
-            path: the .rrd to be written.
-            scan_count: number of scans to come where it is known; long runs get fewer points a scan.
-            live: address of a viewer's server that gets everything at once, too.
+            path: path of the .rrd file to write.
+            scan_count: number of scans to come, if known; long runs get fewer points a scan.
+            live: address of a viewer's server that also gets everything at once.
 
         Raises:
             LioJaxError: the file cannot be created.
@@ -152,11 +152,11 @@ class Recording:
         self._stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def shows_cloud(self, index: int) -> bool:
-        """Tell whether a scan's clouds are logged; of long recordings it is every n-th's."""
+        """Return whether a scan's clouds are logged; in long recordings only every n-th scan's are."""
         return index % self._cloud_every == 0
 
     def log_pose(self, index: int, stamp_ns: int, entity: str, pose: NDArray[np.float64]) -> None:
-        """Log a frame's (4, 4) pose in world; one that is not finite is left out."""
+        """Log a frame's (4, 4) pose in the world; a pose that is not finite is left out."""
         import rerun as rr
 
         stream = self._at(index, stamp_ns)
@@ -173,15 +173,16 @@ class Recording:
         raw: NDArray[np.float32] | None = None,
         corners: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Log one scan and its pose; the trajectory strip grows with it.
+        """Log one scan and its pose; the path grows with it.
 
         Args:
-            index: of the scan.
+            index: index of the scan.
             stamp_ns: absolute time of the pose, ns.
-            points: (n, 3) m in the lidar frame, compensated; thinned here, colour shows the height.
+            points: (n, 3) m, lidar frame, compensated; they are thinned here, and their colour shows the
+                height.
             T_world_lidar: (4, 4); a scan whose pose is not finite is left out.
-            raw: (m, 3) m as recorded.
-            corners: (n,) which of ``points`` are corners, the others being surfaces.
+            raw: (m, 3) m, points as recorded.
+            corners: (n,) which of ``points`` are corners; the others are surfaces.
         """
         if not np.isfinite(T_world_lidar).all():
             return
@@ -202,19 +203,19 @@ class Recording:
             self._strip_length = len(self._positions)
 
     def log_added(self, index: int, stamp_ns: int, points: NDArray[np.float32]) -> None:
-        """Log the (n, 3) points that a scan adds to the map, m in world; the map grows by them in pieces."""
+        """Log the (n, 3) points that a scan adds to the map, m, world frame; the map grows in pieces."""
         self._at(index, stamp_ns)
         if index - self._piece_start >= self._piece_scans:
             self._log_piece()
             self._piece_start = index
-        # thinned as they come, so that a piece's memory is bounded too
+        # thinned on arrival, so that the memory of a piece is bounded, too
         limit = max(1, MAX_MAP_POINTS // (_MAP_PIECES * self._piece_scans))
         self._piece.append(_thinned(points, limit))
         if self.shows_cloud(index):
             self._log_points(ADDED, points, _ADDED_COLOUR)
 
     def log_sigma(self, covariance: NDArray[np.float64]) -> None:
-        """Log the (3, 3) covariance of the position at the last logged scan, m^2 in IMU axes, enlarged."""
+        """Log the (3, 3) covariance of the position at the last logged scan, m^2, IMU axes, enlarged."""
         import rerun as rr
 
         if not np.isfinite(covariance).all():
@@ -229,14 +230,14 @@ class Recording:
         )
 
     def log_unobserved(self, directions: NDArray[np.float64]) -> None:
-        """Log the (k, 3) directions in the lidar frame that the last logged scan leaves open; none clears."""
+        """Log the (k, 3) directions that the last logged scan leaves unobserved, lidar frame; none clears."""
         import rerun as rr
 
         arrows = rr.Arrows3D(vectors=_ARROW_M * directions, colors=[_ADDED_COLOUR] * len(directions))
         self._open_stream().log("world/lidar/unobserved", arrows)
 
     def log_metrics(self, index: int, stamp_ns: int, values: Mapping[str, ArrayLike]) -> None:
-        """Log scalars of a scan, or several of one name, as metrics/NAME (for example times/step)."""
+        """Log scalars of a scan, or several under one name, as metrics/NAME (for example times/step)."""
         import rerun as rr
 
         stream = self._at(index, stamp_ns)
@@ -244,18 +245,18 @@ class Recording:
             stream.log(f"metrics/{name}", rr.Scalars(np.asarray(value, np.float64)))
 
     def log_trajectory(self, positions: NDArray[np.floating]) -> None:
-        """Log the (n, 3) positions in world as they are known at the last logged scan."""
+        """Log the (n, 3) positions, world frame, as they are estimated at the last logged scan."""
         self._log_strip("world/trajectory", positions, _ESTIMATE_COLOUR, static=False)
 
     def log_correction(
         self, positions: NDArray[np.floating], keyframes: NDArray[np.floating], loops: Mapping[str, NDArray]
     ) -> None:
-        """Log what the back end found, as it is known at the last logged scan.
+        """Log the results of the back end at the last logged scan.
 
         Args:
-            positions: (n, 3) m in world, of the corrected trajectory.
-            keyframes: (k, 3) m.
-            loops: "closed" and "refused": (m, 2, 3) m, the ends of each.
+            positions: (n, 3) m, world frame, of the corrected trajectory.
+            keyframes: (k, 3) m, world frame.
+            loops: "closed" and "refused": the ends of each loop, (m, 2, 3) m, world frame.
         """
         import rerun as rr
 
@@ -268,11 +269,11 @@ class Recording:
             )
 
     def log_truth(self, positions: NDArray[np.floating]) -> None:
-        """Log the (n, 3) true positions, already laid into the estimate's world, for all times."""
+        """Log the (n, 3) true positions, already aligned with the estimate's world, for all times."""
         self._log_strip("world/truth", positions, _TRUTH_COLOUR, static=True)
 
     def close(self) -> None:
-        """Finish the file and give it its name; closing twice is allowed.
+        """Finish the file and rename it to its path; closing twice is allowed.
 
         Raises:
             LioJaxError: the file could not be written.
@@ -305,7 +306,7 @@ class Recording:
         self._file.__exit__(None if error is None else type(error), error, None)
 
     def _log_piece(self) -> None:
-        """Log the piece of the map that is complete."""
+        """Log the complete piece of the map."""
         points = np.concatenate(self._piece) if self._piece else np.zeros((0, 3), np.float32)
         self._piece = []
         if not len(points):
@@ -316,7 +317,7 @@ class Recording:
         self._pieces += 1
 
     def _log_points(self, entity: str, points: NDArray, colours: Any, radius: float = -1.5) -> None:
-        """Log points, scans' thinned to what the recording affords; a negative radius is in screen points."""
+        """Log points, thinned if they are a scan's; a negative radius is in screen points."""
         import rerun as rr
 
         kept: Any = slice(None)
@@ -347,10 +348,10 @@ class Recording:
 
 
 def _thinned(points: NDArray[np.floating], limit: int) -> NDArray[np.float32]:
-    """Return at most ``limit`` of the points, spread evenly over their order."""
+    """Return at most ``limit`` of the points, evenly spaced in their order."""
     return np.ascontiguousarray(points[_spread(len(points), limit)], np.float32)
 
 
 def _spread(count: int, limit: int) -> Any:
-    """Return which of ``count`` things are kept: ``limit`` at most, spread evenly."""
+    """Return which of ``count`` items are kept: at most ``limit``, evenly spaced."""
     return slice(None) if count <= limit else np.linspace(0, count - 1, limit).astype(np.int64)

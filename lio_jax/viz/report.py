@@ -1,4 +1,4 @@
-"""A run's report.html: what a researcher looks at before reading numbers. The folder is all it needs."""
+"""Write a run's report.html, the overview of its results; it needs only the run's folder."""
 
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,11 @@ def write_report(folder: Path, out: Path | None = None) -> Path:
     """Write the report of a run folder and return its path.
 
     Args:
-        folder: of a run.
-        out: where to; None: report.html in the folder.
+        folder: folder of a run.
+        out: file to write; None: report.html in the folder.
 
     Raises:
-        LioJaxError: the folder is none of a run, or a file of it is damaged.
+        LioJaxError: the folder is not a run's, or a file of it is damaged.
     """
     path = out or folder / "report.html"
     text = run_report(read_run(folder))
@@ -68,7 +68,7 @@ def _global_correction(run: RunRecord) -> str:
 
 
 def headline(run: RunRecord) -> dict[str, str]:
-    """Return the numbers that matter by name, as text with units."""
+    """Return the most important numbers by name, as text with units."""
     metrics = run.metrics
     total = metrics.get("scan_ms", {}).get("total", {})
     values: dict[str, str] = {

@@ -1,4 +1,4 @@
-"""The figures of a run that its report shows."""
+"""The figures of a run for its report."""
 
 import base64
 import struct
@@ -18,7 +18,7 @@ from lio_jax.viz.run_record import Comparison, RunRecord
 from lio_jax.viz.svg import WIDTH, Line, box_chart, empty, equal_axes, line_chart, plan_chart, stack_chart
 
 _INK = (108, 122, 136)
-"""A grey that shows on white and on black; how full a pixel is decides how opaque it is."""
+"""A grey that is visible on white and on black; the count of points in a pixel sets its opacity."""
 _FAINTEST = 60
 _FULL_PERCENTILE = 98.0
 
@@ -26,15 +26,16 @@ _FULL_PERCENTILE = 98.0
 def map_png(
     points: NDArray[np.floating], x: tuple[float, float], y: tuple[float, float], width: int
 ) -> bytes:
-    """Return a picture with one scale in both directions; where nothing is it is transparent.
+    """Return a picture with the same scale in both directions; pixels without points are transparent.
 
-    The more points stand above each other, the darker: walls and trunks stand out from ground and ceiling.
+    The more points are above each other, the darker the pixel: walls and trunks differ from ground and
+    ceiling.
 
     Args:
-        points: (n, 3) m in world, z up.
+        points: (n, 3) m, world frame, z up.
         x: left and right edge, m.
         y: lower and upper edge, m.
-        width: pixels; the height follows.
+        width: width in pixels; the height follows from the scale.
     """
     scale = width / (x[1] - x[0])
     height = max(1, round((y[1] - y[0]) * scale))
@@ -49,12 +50,12 @@ def map_png(
 
 
 def data_uri(png: bytes) -> str:
-    """Return a picture as an address that holds it."""
+    """Return a picture as an address that contains the data."""
     return "data:image/png;base64," + base64.b64encode(png).decode()
 
 
 def _ink_png(opacity: NDArray[np.uint8]) -> bytes:
-    """Encode one colour of varying opacity (PNG, W3C recommendation, third edition: palette with tRNS)."""
+    """Encode one colour with varying opacity (PNG, W3C recommendation, third edition: palette with tRNS)."""
     height, width = opacity.shape
     rows = np.concatenate([np.zeros((height, 1), np.uint8), opacity], axis=1)
     chunks = (
@@ -79,7 +80,7 @@ _AXES = [("x", 0), ("y", 1), ("z", 2)]
 
 
 def from_above(run: RunRecord) -> list[str]:
-    """Return map and way from above, to scale: the whole map, and the way alone."""
+    """Return map and path from above, to scale: first the whole map, then the path alone."""
     xy = run.trajectory.positions[:, :2]
     lines = [Line(xy[:, 0], xy[:, 1], 0)]
     legend = [("estimate", 0)]
@@ -97,7 +98,7 @@ def from_above(run: RunRecord) -> list[str]:
         return drawn
     low, high = np.percentile(points[:: max(1, len(points) // 100_000), :2], [1.0, 99.0], axis=0)
     whole = equal_axes([*path[0], np.array([low[0], high[0]])], [*path[1], np.array([low[1], high[1]])])
-    assert whole is not None  # the path is within
+    assert whole is not None  # the whole map includes the path
     edges = (whole.x_low, whole.x_high), (whole.y_low, whole.y_high)
     behind = data_uri(map_png(points, *edges, _MAP_PIXELS))
     svg = plan_chart(whole, lines, "x [m]", "y [m]", behind)
@@ -106,7 +107,7 @@ def from_above(run: RunRecord) -> list[str]:
 
 
 def loops_closed(run: RunRecord) -> list[str]:
-    """Return the way before and after its correction, with the loops between keyframes."""
+    """Return the path before and after its correction, with the loops between keyframes."""
     found = run.correction
     if found is None:
         return []
@@ -115,7 +116,7 @@ def loops_closed(run: RunRecord) -> list[str]:
     legend = [("odometry", 1), ("corrected", 0)]
     for closed, name, series in ((False, "refused", 7), (True, "closed", 2)):
         strips = found.strips(closed)
-        # a value that is not finite parts one loop from the next
+        # a value that is not finite separates the loops from each other
         apart = np.concatenate([strips, np.full((len(strips), 1, 3), np.nan)], axis=1).reshape(-1, 3)
         if len(strips):
             lines.append(Line(apart[:, 0], apart[:, 1], series))
@@ -128,7 +129,7 @@ def loops_closed(run: RunRecord) -> list[str]:
 
 
 def from_the_side(run: RunRecord) -> str:
-    """Return the height over the way."""
+    """Return the height over the distance travelled."""
     lines, legend = [Line(run.distance, run.trajectory.positions[:, 2], 0)], [("estimate", 0)]
     if run.comparison:
         way = way_of(run, run.comparison.matched.estimate)
@@ -138,7 +139,7 @@ def from_the_side(run: RunRecord) -> str:
 
 
 def errors(run: RunRecord, compared: Comparison) -> list[str]:
-    """Return position and attitude error over the way and over time."""
+    """Return position and attitude error over the distance travelled and over time."""
     matched = compared.matched
     metres = position_errors(compared.alignment, matched.estimate.poses, matched.reference.poses)
     turn = compared.alignment.T_reference_estimate_attitude[:3, :3]
@@ -162,7 +163,7 @@ def errors(run: RunRecord, compared: Comparison) -> list[str]:
 
 
 def relative_error_boxes(compared: Comparison) -> list[str]:
-    """Return the relative pose error over ways of several lengths, from every pose."""
+    """Return the relative pose error over several distances, from every pose on."""
     metres, degrees = relative_error_groups(compared)
     caption = "From every pose on; box: quartiles, whiskers: 5 and 95 %, dot: largest."
     return [
@@ -172,7 +173,7 @@ def relative_error_boxes(compared: Comparison) -> list[str]:
 
 
 def relative_error_groups(compared: Comparison) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
-    """Return errors in % of the way and in deg by length, for the longest lengths with enough pairs."""
+    """Return errors in % and in deg by distance, for the longest distances with enough pairs."""
     matched = compared.matched
     reference = matched.reference.poses
     starts = np.arange(len(reference))
@@ -189,7 +190,7 @@ def relative_error_groups(compared: Comparison) -> tuple[dict[str, NDArray], dic
 
 
 def belief(run: RunRecord) -> list[str]:
-    """Return biases with their sigma, the pose's sigma and the NIS: what the filter believed."""
+    """Return biases with sigma, the pose's sigma, and the NIS: state and confidence of the filter."""
     drawn = []
     sigma = None
     if "state_covariance" in run.states:
@@ -223,7 +224,7 @@ def belief(run: RunRecord) -> list[str]:
 
 
 def innovations(run: RunRecord) -> list[str]:
-    """Return the NIS with the band that holds 95 % of a consistent filter's."""
+    """Return the NIS with the band that contains 95 % of a consistent filter's values."""
     freedom = run.states["nis_dof"]
     known = freedom > 0
     if not known.any():
@@ -241,7 +242,7 @@ def innovations(run: RunRecord) -> list[str]:
 
 
 def nis_band(freedom: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the two bounds of 95 % of chi-square for each number of degrees of freedom, NaN for none."""
+    """Return both bounds of 95 % of chi-square for each number of degrees of freedom; NaN for 0."""
     known, place = np.unique(freedom, return_inverse=True)
     bounds = [chi2.ppf([0.025, 0.975], dof) if dof > 0 else (np.nan, np.nan) for dof in known]
     low, high = np.array(bounds)[place].T
@@ -267,7 +268,7 @@ def matching(run: RunRecord) -> list[str]:
 
 
 def times(run: RunRecord) -> list[str]:
-    """Return where each scan's time went."""
+    """Return the figures of each scan's time by stage."""
     stages = {
         name: run.scans[f"{name}_ms"] for name in ("pad", "step", "record") if f"{name}_ms" in run.scans
     }
@@ -278,7 +279,7 @@ def times(run: RunRecord) -> list[str]:
     legend = [(name, number) for number, name in enumerate(stages)]
     return [
         figure(
-            "Time of each scan", stack, "Cut off at the 99th percentile; decoding runs beside it.", legend
+            "Time of each scan", stack, "Cut off at the 99th percentile; decoding runs in parallel.", legend
         ),
         figure("Time by stage", box_chart(boxes, "time [ms]"), "Box: quartiles, whiskers: 5 and 95 %."),
     ]
@@ -293,5 +294,5 @@ def _failed_at(run: RunRecord, x: NDArray[np.float64]) -> list[float]:
 
 
 def way_of(run: RunRecord, part: Trajectory) -> NDArray[np.float64]:
-    """Return the way at the poses of a part of the run's trajectory, m."""
+    """Return the distance travelled, m, at the poses of a part of the run's trajectory."""
     return run.distance[np.searchsorted(run.trajectory.stamp_ns, part.stamp_ns)]

@@ -1,4 +1,4 @@
-"""Read a run folder back."""
+"""Read a run folder."""
 
 import json
 from dataclasses import dataclass, field, replace
@@ -22,16 +22,16 @@ class CorrectionRecord:
     """The corrected trajectory, and the loops between keyframes."""
 
     trajectory: Trajectory
-    """T_world_imu at the scans' ends."""
+    """Corrected T_world_imu at the scans' ends."""
     keyframes: NDArray[np.float64]
-    """(k, 3) m, positions in world."""
+    """Positions of the keyframes, (k, 3) m, world frame."""
     loops: list[dict[str, Any]]
-    """As in loops.json."""
+    """Entries of loops.json."""
 
     def strips(self, closed: bool) -> NDArray[np.float64]:
-        """Return (n, 2, 3) m, the ends of the loops that are closed, or of those that were refused.
+        """Return the ends of the closed loops, or of the refused ones, (n, 2, 3) m.
 
-        Of the latter a keyframe's first alone: it may have been compared with many others.
+        Of a keyframe's refused loops only the first is returned: there may be many.
         """
         chosen: dict[Any, tuple[int, int]] = {}
         for number, loop in enumerate(self.loops):
@@ -43,7 +43,7 @@ class CorrectionRecord:
 
 
 def read_correction(folder: Path) -> CorrectionRecord | None:
-    """Read what the back end left; None in a run without one.
+    """Read the results of the back end; return None for a run without one.
 
     Raises:
         LioJaxError: a file is damaged.
@@ -64,14 +64,14 @@ _NEEDED = ("states.npz", "metrics.json", "config.yaml")
 
 @dataclass(frozen=True)
 class Comparison:
-    """A run's poses beside the true ones of the same instants."""
+    """Estimated poses of a run, and the true poses at the same instants."""
 
     matched: MatchedTrajectories
     alignment: Alignment
 
     @property
     def truth(self) -> Trajectory:
-        """The true poses, laid into the estimate's world as the absolute error is aligned."""
+        """The true poses, aligned with the estimate's world as for the absolute error."""
         T_estimate_reference = np.linalg.inv(self.alignment.T_reference_estimate)
         return Trajectory(
             self.matched.reference.stamp_ns, T_estimate_reference @ self.matched.reference.poses
@@ -80,7 +80,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """One run folder."""
+    """The contents of one run folder."""
 
     folder: Path
     metrics: dict[str, Any]
@@ -89,48 +89,48 @@ class RunRecord:
     states: dict[str, NDArray]
     """Columns of states.npz."""
     scans: dict[str, NDArray]
-    """Columns of scans.npz; none of a run that wrote none."""
+    """Columns of scans.npz; empty for a run that wrote none."""
     comparison: Comparison | None = None
-    """None without truth."""
+    """Comparison with the truth; None where there is no truth."""
     remarks: list[str] = field(default_factory=list)
-    """What could not be read or compared."""
+    """Sentences on what could not be read or compared."""
     correction: CorrectionRecord | None = None
-    """None of a run without a back end."""
+    """Results of the back end; None for a run without one."""
 
     @property
     def trajectory(self) -> Trajectory:
-        """T_world_imu at the scans' ends, corrected where there was a back end."""
+        """T_world_imu at the scans' ends, corrected if there was a back end."""
         return self.correction.trajectory if self.correction else self.odometry
 
     @property
     def odometry(self) -> Trajectory:
-        """T_world_imu at the scans' ends as it was estimated scan by scan."""
+        """T_world_imu at the scans' ends as the odometry estimated it, scan by scan."""
         return Trajectory(self.states["stamps_ns"], self.states["poses"])
 
     @property
     def seconds(self) -> NDArray[np.float64]:
-        """(n,) time since the first pose, s."""
+        """Time since the first pose, (n,) s."""
         return self.seconds_of(self.trajectory)
 
     @property
     def distance(self) -> NDArray[np.float64]:
-        """(n,) way since the first pose, m; a pose that is not finite adds nothing."""
+        """Distance travelled since the first pose, (n,) m; a pose that is not finite adds nothing."""
         steps = np.linalg.norm(np.diff(self.trajectory.positions, axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(steps), steps, 0.0))])
 
     @property
     def title(self) -> str:
-        """Recording and recipe."""
+        """Title of the run: recording and recipe."""
         recording = self.metrics.get("recording", {}).get("name") or self.folder.name
         return f"{recording}, {self.config.get('recipe', 'unknown recipe')}"
 
     def seconds_of(self, trajectory: Trajectory) -> NDArray[np.float64]:
-        """Return when the poses of another trajectory are, s since this run's first pose."""
+        """Return the times of another trajectory's poses, s since this run's first pose."""
         since: NDArray[np.float64] = (trajectory.stamp_ns - self.states["stamps_ns"][0]) * 1e-9
         return since
 
     def map_points(self) -> NDArray[np.float32] | None:
-        """Return the map's (n, 3) points, m in world; None where the run wrote none."""
+        """Return the map's points, (n, 3) m, world frame; None where the run wrote none."""
         path = self.folder / "map.pcd"
         if not path.is_file():
             return None
@@ -141,7 +141,7 @@ def read_run(folder: Path) -> RunRecord:
     """Read a run folder.
 
     Raises:
-        LioJaxError: it is none, or a file of it is damaged.
+        LioJaxError: the folder is not a run's, or a file of it is damaged.
     """
     missing = [name for name in _NEEDED if not (folder / name).is_file()]
     if missing:

@@ -1,4 +1,4 @@
-"""Write a run into a recording while it goes on."""
+"""Write a recording for the viewer while a run goes on."""
 
 from pathlib import Path
 
@@ -71,7 +71,7 @@ def _in_world_of(estimate: Trajectory, truth: Trajectory) -> Trajectory:
 def _compensated(
     tracked: ScanResult, T_world_lidar: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
-    """Return the compensated scan in the lidar frame, and which points are corners where that is known."""
+    """Return the compensated scan in the lidar frame, and which points are corners where this is known."""
     output = tracked.output
     points = np.asarray(output.points)
     kept = np.arange(0, len(points), max(1, len(points) // _POINTS))
@@ -109,9 +109,9 @@ def _biases(tracked: ScanResult) -> dict[str, NDArray[np.float64]]:
 
 
 def _unobserved(tracked: ScanResult, T_world_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (k, 3) open directions in the lidar frame: of the position, or the axis of a turn."""
+    """Return the (k, 3) unobservable directions in the lidar frame, of the position or of a rotation axis."""
     found = tracked.output.registration
-    # the first scan has nothing to be matched with
+    # the first scan has no map to be matched with
     told = tracked.index > 0 and np.isfinite(np.asarray(found.information)).all()
     weak = weak_directions(found) if told else np.zeros((6, 0))
     turns, moves = weak[:3], weak[3:]

@@ -11,20 +11,20 @@ from numpy.typing import NDArray
 from lio_jax.viz.html import series_colour
 
 WIDTH, HEIGHT = 480.0, 250.0
-"""Drawing units; text of 11 units stays legible when this width fills a phone's."""
+"""Size in drawing units; text of 11 units is legible when this width fills a phone's screen."""
 _LEFT, _RIGHT, _TOP, _BOTTOM = 60.0, 12.0, 10.0, 34.0
 
 
 @dataclass(frozen=True)
 class Axes:
-    """A rectangle of the drawing and the values at its edges."""
+    """A rectangle of the drawing, and the values at its edges."""
 
     x_low: float
     x_high: float
     y_low: float
     y_high: float
     log: bool = False
-    """Whether y is logarithmic; the bounds are then exponents of ten."""
+    """Whether y is logarithmic; the bounds are then powers of ten by their exponents."""
     width: float = WIDTH
     height: float = HEIGHT
     left: float = _LEFT
@@ -41,12 +41,12 @@ class Axes:
         return self.height - _BOTTOM
 
     def x(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return where values stand, drawing units from the left."""
+        """Return the places of values, drawing units from the left."""
         share = (np.asarray(values, np.float64) - self.x_low) / (self.x_high - self.x_low)
         return self.left + share * (self.right - self.left)
 
     def y(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return where values stand, drawing units from the top; NaN where a logarithm has none."""
+        """Return the places of values, drawing units from the top; NaN where the logarithm is not defined."""
         numbers = np.asarray(values, np.float64)
         if self.log:
             numbers = np.log10(numbers, out=np.full_like(numbers, np.nan), where=numbers > 0)
@@ -57,7 +57,7 @@ class Axes:
 def axes_of(
     xs: Sequence[NDArray], ys: Sequence[NDArray], *, from_zero: bool = False, log: bool = False
 ) -> Axes | None:
-    """Return axes that hold all finite values; None where there are none."""
+    """Return axes that contain all finite values; None where there are none."""
     x, y = _finite(xs), _finite(ys)
     if log:
         y = np.log10(y[y > 0])
@@ -71,7 +71,7 @@ def axes_of(
 
 
 def equal_axes(xs: Sequence[NDArray], ys: Sequence[NDArray], width: float = 720.0) -> Axes | None:
-    """Return axes of one scale in both directions, at most as high as wide; None without finite values."""
+    """Return axes with one scale in both directions, at most as high as wide; None without finite values."""
     x, y = _finite(xs), _finite(ys)
     if not len(x) or not len(y):
         return None
@@ -86,7 +86,7 @@ def equal_axes(xs: Sequence[NDArray], ys: Sequence[NDArray], width: float = 720.
 
 
 def round_ticks(low: float, high: float, most: int = 6) -> NDArray[np.float64]:
-    """Return the multiples of 1, 2 or 5 times a power of ten within a range, ``most`` at most."""
+    """Return the multiples of 1, 2 or 5 times a power of ten within a range, at most ``most`` of them."""
     rough = (high - low) / most
     power = 10.0 ** np.floor(np.log10(rough))
     step = next((factor * power for factor in (1, 2, 5) if factor * power >= rough), 10 * power)
@@ -97,10 +97,10 @@ def frame(axes: Axes, x_label: str, y_label: str, x_ticks: Mapping[float, str] |
     """Draw grid, ticks and labels.
 
     Args:
-        axes: to draw.
+        axes: the axes to draw.
         x_label: quantity and unit, plain text.
-        y_label: the same of the upright axis.
-        x_ticks: texts at places, instead of numbers.
+        y_label: quantity and unit of the vertical axis, plain text.
+        x_ticks: texts at given values, in place of numbers.
     """
     if x_ticks is None:
         places = round_ticks(axes.x_low, axes.x_high, round(axes.width / 80))
@@ -133,7 +133,7 @@ def frame(axes: Axes, x_label: str, y_label: str, x_ticks: Mapping[float, str] |
 
 
 def _log_ticks(low: float, high: float) -> NDArray[np.float64]:
-    """Return round numbers between two powers of ten, the finer the nearer these are."""
+    """Return round numbers between two powers of ten; the nearer the powers, the finer the numbers."""
     decades = high - low
     step = max(1, round(decades / 6))
     powers = np.arange(np.floor(low / step) * step, high + step, step)
@@ -145,7 +145,7 @@ def _log_ticks(low: float, high: float) -> NDArray[np.float64]:
 
 
 def _numbers(ticks: NDArray[np.float64]) -> list[str]:
-    """Write ticks with as many decimals as tell them apart."""
+    """Write ticks with enough decimals to distinguish them."""
     if not len(ticks):
         return []
     largest = float(np.max(np.abs(ticks)))
@@ -175,7 +175,7 @@ def _span(low: float, high: float, margin: float) -> tuple[float, float]:
 _SERIES_POINTS = 800
 _PATH_POINTS = 4000
 _CELL = 0.4
-"""Consecutive points of a path closer than this are one, drawing units."""
+"""Consecutive points of a path that are closer than this are drawn as one, drawing units."""
 
 
 @dataclass(frozen=True)
@@ -185,10 +185,10 @@ class Line:
     x: NDArray[np.floating]
     y: NDArray[np.floating]
     series: int = 0
-    """Number of its colour."""
+    """Number of the curve's colour."""
     dashed: bool = False
     sigma: NDArray[np.floating] | None = field(default=None)
-    """Half height of a band around it."""
+    """Half height of a band around the curve, in units of y."""
 
 
 def line_chart(
@@ -201,16 +201,16 @@ def line_chart(
     from_zero: bool = False,
     log: bool = False,
 ) -> str:
-    """Draw curves over a shared axis.
+    """Draw curves over a common axis.
 
     Args:
         lines: the curves.
-        x_label: quantity and unit.
-        y_label: quantity and unit.
-        band: x, low and high of a shaded range.
-        marks: x of upright strokes, such as failed scans.
-        from_zero: let the scale begin at zero.
-        log: logarithmic scale; values that are not positive are left out.
+        x_label: quantity and unit of x.
+        y_label: quantity and unit of y.
+        band: x, lower and upper bound of a shaded range.
+        marks: x of vertical strokes, for example failed scans.
+        from_zero: whether the scale begins at zero.
+        log: whether the scale is logarithmic; values that are not positive are left out.
     """
     xs, ys = [line.x for line in lines], [line.y for line in lines]
     for line in lines:
@@ -236,14 +236,14 @@ def line_chart(
 
 
 def plan_chart(axes: Axes, lines: Sequence[Line], x_label: str, y_label: str, behind: str = "") -> str:
-    """Draw paths with their start (dot), over a picture that fills the axes.
+    """Draw paths, each with a dot at its start, over a picture that fills the axes.
 
     Args:
-        axes: of one scale in both directions.
+        axes: axes with one scale in both directions.
         lines: the paths.
-        x_label: quantity and unit.
-        y_label: quantity and unit.
-        behind: address of the picture, such as a data URI.
+        x_label: quantity and unit of x.
+        y_label: quantity and unit of y.
+        behind: address of the picture, for example a data URI.
     """
     drawn = [frame(axes, x_label, y_label)]
     if behind:
@@ -260,9 +260,9 @@ def plan_chart(axes: Axes, lines: Sequence[Line], x_label: str, y_label: str, be
 
 
 def stack_chart(parts: Mapping[str, NDArray[np.floating]], x: NDArray, x_label: str, y_label: str) -> str:
-    """Draw quantities on top of each other, the first at the bottom; each is non-negative, over ``x``.
+    """Draw non-negative quantities over ``x`` on top of each other; the first is at the bottom.
 
-    The scale ends at the sum's 99th percentile, so that a single slow scan does not flatten all others.
+    The scale ends at the 99th percentile of the sum, so that a single slow scan does not flatten the rest.
     """
     layers = (
         np.cumsum([np.nan_to_num(values) for values in parts.values()], axis=0) if parts else np.zeros((0, 0))
@@ -308,7 +308,7 @@ def box_chart(groups: Mapping[str, NDArray[np.floating]], y_label: str, series: 
 
 
 def curve(axes: Axes, line: Line) -> str:
-    """Draw one curve in given axes."""
+    """Draw one curve in the given axes."""
     x, y = axes.x(line.x), axes.y(line.y)
     finite = np.isfinite(x) & np.isfinite(y)
     pieces = np.split(np.flatnonzero(finite), np.flatnonzero(np.diff(np.flatnonzero(finite)) > 1) + 1)
@@ -318,7 +318,7 @@ def curve(axes: Axes, line: Line) -> str:
 
 
 def empty(text: str) -> str:
-    """Return a drawing that says why there is none."""
+    """Return a drawing with the reason why there is no chart."""
     words = f'<text x="{WIDTH / 2}" y="40" text-anchor="middle">{escape(text)}</text>'
     return _svg([words], text, Axes(0.0, 1.0, 0.0, 1.0, height=80.0))
 
@@ -334,7 +334,7 @@ def _ribbon(axes: Axes, x: NDArray, low: NDArray, high: NDArray, series: int, ki
         return ""
     x, low, high = x[finite], low[finite], high[finite]
     groups = np.unique(np.linspace(0, len(x), min(len(x), _SERIES_POINTS), endpoint=False).astype(int))
-    # the widest within each group: a thinned band must not hide what it covers
+    # the widest of each group: a thinned band must not hide values that it covers
     across, least, most = x[groups], np.minimum.reduceat(low, groups), np.maximum.reduceat(high, groups)
     along = np.concatenate([axes.x(across), axes.x(across)[::-1]])
     edge = np.concatenate([axes.y(most), axes.y(least)[::-1]])
@@ -355,7 +355,7 @@ def _thinned(x: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _without_repeats(x: NDArray, y: NDArray, cell: float) -> tuple[NDArray, NDArray]:
-    """Return a path without points in the cell of the one before; in coarser cells until few are left."""
+    """Return a path without points in the cell of the point before; cells grow until few points are left."""
     cells = np.round(np.stack([x, y]) / cell)
     kept = np.any(np.diff(cells, axis=1, prepend=np.inf) != 0, axis=0)
     kept[-1] = True
@@ -366,5 +366,5 @@ def _without_repeats(x: NDArray, y: NDArray, cell: float) -> tuple[NDArray, NDAr
 
 def _path(x: NDArray, y: NDArray) -> str:
     points = [f"{a:.1f} {b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True)]
-    # a single point shows as the round end of a line without length
+    # a single point is drawn as the round end of a line without length
     return "M" + "L".join(points if len(points) > 1 else points * 2)

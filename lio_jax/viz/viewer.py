@@ -1,4 +1,4 @@
-"""rerun's viewer in processes of its own, reachable from this computer alone."""
+"""Run rerun's viewer in separate processes, reachable from this computer only."""
 
 import json
 import os
@@ -24,12 +24,12 @@ _POLL_S = 0.05
 
 @dataclass(frozen=True)
 class Server:
-    """A viewer that is served to browsers of this computer."""
+    """A viewer that is served to browsers on this computer."""
 
     page: str
-    """Address to open."""
+    """Address to open in a browser."""
     stream: str
-    """Address that a recording is sent to."""
+    """Address to which a recording is sent."""
     process: subprocess.Popen[bytes]
 
 
@@ -38,10 +38,10 @@ def served(recording: Path | None = None) -> Iterator[Server]:
     """Serve the web viewer on loopback during the block.
 
     Args:
-        recording: an .rrd to show; None: what is sent to the stream's address.
+        recording: an .rrd file to show; None: the data that is sent to the stream's address.
 
     Raises:
-        LioJaxError: it does not start.
+        LioJaxError: the viewer does not start.
     """
     data_port, page_port = _free_ports(2)
     ports = ["--port", str(data_port), "--web-viewer-port", str(page_port)]
@@ -54,7 +54,7 @@ def served(recording: Path | None = None) -> Iterator[Server]:
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            # Ctrl-C is for whoever started the viewer, who then ends it
+            # Ctrl-C goes to the process that started the viewer, which then ends the viewer
             start_new_session=True,
         )
         try:
@@ -66,7 +66,7 @@ def served(recording: Path | None = None) -> Iterator[Server]:
 
 
 def show(recording: Path) -> None:
-    """Open the viewer's own window and wait until it is closed.
+    """Open the viewer's own window, and wait until the user closes it.
 
     Raises:
         LioJaxError: there is no screen, or the viewer ended at once.
@@ -87,7 +87,7 @@ def show(recording: Path) -> None:
 
 
 def _rerun() -> list[str]:
-    """Return the viewer's program; ending Python's wrapper around it would leave it running."""
+    """Return the viewer's program itself: the end of its Python wrapper would leave it running."""
     found = find_spec("rerun_cli")
     for folder in (found.submodule_search_locations or []) if found else []:
         for name in ("rerun", "rerun.exe"):
@@ -97,7 +97,7 @@ def _rerun() -> list[str]:
 
 
 def _without_usage_data(home: Path) -> dict[str, str]:
-    """Return the environment with settings of the viewer's own in ``home`` that turn off its usage data."""
+    """Return an environment in which the viewer's settings, in ``home``, turn off its usage data."""
     settings = home / "rerun" / "analytics.json"
     settings.parent.mkdir()
     settings.write_text(json.dumps({"analytics_enabled": False, "analytics_id": "", "metadata": {}}))
@@ -125,7 +125,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _wait(process: subprocess.Popen[bytes], port: int) -> None:
-    """Wait until the process answers at a port."""
+    """Wait until the process accepts connections at a port."""
     until = time.monotonic() + _START_S
     while time.monotonic() < until and process.poll() is None:
         with socket.socket() as probe:

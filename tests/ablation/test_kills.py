@@ -20,7 +20,7 @@ KILLS_OF_WORKERS, KILLS_OF_COMMANDS = 15, 6
 
 
 def results(root):
-    """Return what is in every finished result, and tell it from a later one of the same name."""
+    """Return the contents of every finished result, with what identifies it among later ones."""
     tasks = root / "tasks"
     found = {}
     for entry in tasks.iterdir() if tasks.is_dir() else ():
@@ -48,7 +48,7 @@ def worker_processes(of):
 
 
 def test_workers_are_killed(tmp_path):
-    """The same command goes on: a run whose worker dies is begun again."""
+    """The command continues after a worker's death: the run of that worker starts again."""
     draw = random.Random(1)
     killed, over = [], threading.Event()
 
@@ -76,7 +76,7 @@ def test_workers_are_killed(tmp_path):
 
 
 def test_commands_are_killed(tmp_path):
-    """The command is started anew each time; what was done stays as it was, to the last one."""
+    """The command is started again each time; finished runs stay unchanged until the last one is done."""
     draw = random.Random(2)
     root = tmp_path / "out"
     before, kills = {}, 0

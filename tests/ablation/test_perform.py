@@ -1,4 +1,4 @@
-"""What a worker leaves behind: alone or in a batch, in whatever order, and when something goes wrong."""
+"""The results of a worker: alone or in a batch, in any order, and after an error."""
 
 import json
 from dataclasses import replace
@@ -83,7 +83,7 @@ def test_a_batch_equals_the_runs_one_by_one(tmp_path, monkeypatch):
 
 
 def test_a_batch_leaves_what_the_runs_one_by_one_leave(tmp_path):
-    """As recorded, in single precision: to what that holds at the range of the points."""
+    """Points agree as recorded, in single precision at their range."""
     tables, names = [], []
     for batch in (1, 3):
         tasks = tasks_of(load_spec(write_spec(tmp_path / "spec.yaml", batch=batch)))

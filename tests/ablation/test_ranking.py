@@ -1,4 +1,4 @@
-"""The ranking and its tests against scipy, by hand, and where there is little to tell."""
+"""The ranking and its tests against scipy, by hand, and with little data."""
 
 import math
 

@@ -13,7 +13,7 @@ from tests.run.program_cache import kept_programs
 
 @dataclass(frozen=True)
 class Done:
-    """What a command left behind."""
+    """Output and status of a command."""
 
     status: int
     out: str

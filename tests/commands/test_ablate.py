@@ -24,7 +24,7 @@ SMOKE = Path(__file__).parents[2] / "configs" / "ablations" / "smoke.yaml"
 
 
 class Page(HTMLParser):
-    """What a page refers to, what stands in it, and whether its elements are closed."""
+    """Read a page: its references, its text, and whether its elements are closed."""
 
     def __init__(self, text):
         super().__init__()

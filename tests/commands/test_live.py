@@ -1,4 +1,4 @@
-"""A run may be watched from this computer while it goes on, and is written all the same."""
+"""A run may be watched from this computer while it goes on; its files are written in full."""
 
 import re
 

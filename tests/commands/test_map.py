@@ -118,7 +118,7 @@ def test_no_run_folder(cli, tmp_path):
 def test_corners_of_a_run_that_kept_only_its_map(cli, tmp_path):
     write_cloud(tmp_path / "map.pcd", [CLOUDS[0]], 500)
     done = cli("map", tmp_path, "--out", tmp_path / "corner.pcd", "--part", "corner")
-    assert "does not tell corners from surfaces" in refused(done, 1)
+    assert "does not separate corners from surfaces" in refused(done, 1)
 
 
 def test_an_unfinished_run_and_a_damaged_keyframe(cli, run_folder, tmp_path):

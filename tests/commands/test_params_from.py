@@ -1,4 +1,4 @@
-"""``--params-from``: which recipe is taken, who wins, and what is said."""
+"""``--params-from``: the recipe that is taken, the order of precedence, and the messages."""
 
 import pytest
 import yaml

@@ -60,7 +60,7 @@ def test_a_tuning_leaves_settings_history_and_a_picture(recordings, tmp_path, ca
     assert settings.values["lidar"]["range_sigma"] == pytest.approx(np.exp(best["x"][1]))
 
     assert main([*words, "--iterations", "4"]) == 0
-    assert "going on after 3 evaluations" in capsys.readouterr().err
+    assert "continuing after 3 evaluations" in capsys.readouterr().err
     assert len(json.loads((out / "history.json").read_text())["iterates"]) == 4
 
 

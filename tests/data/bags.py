@@ -94,7 +94,7 @@ _DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8
 
 @dataclass(frozen=True)
 class Sweep:
-    """What a 16-beam sensor that turns clockwise once in 0.1 s sees in a round room; ring after ring."""
+    """Scan of a 16-beam sensor in a round room, ring after ring; it turns clockwise once in 0.1 s."""
 
     points: np.ndarray
     time: np.ndarray

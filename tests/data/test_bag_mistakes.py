@@ -1,4 +1,4 @@
-"""A bag appears whole or not at all, and what stands in its way is said in one sentence."""
+"""A bag appears complete or not at all, and one sentence names the reason."""
 
 import errno
 from collections.abc import Iterator

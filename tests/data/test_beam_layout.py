@@ -1,4 +1,4 @@
-"""What the elevations of a scan say about the beams it is said to have."""
+"""The elevations of a scan confirm or contradict the number of beams that is assumed."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Fixes that cannot be used are left out, and it is said; the others keep their numbers."""
+"""Fixes that cannot be used are left out and reported; the others are unchanged."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Gravity tells the accelerometer's unit."""
+"""The accelerometer's unit is recognised by gravity."""
 
 from dataclasses import replace
 

@@ -5,7 +5,7 @@ import pytest
 from lio_jax.data.time_order import Stamped, ascending, in_time_order
 
 HOUR = 36_000
-"""In tenths of a second, as all times here."""
+"""One hour in tenths of a second, the unit of all times here."""
 
 
 def kept(*tenths: float) -> tuple[list[float], list[str]]:

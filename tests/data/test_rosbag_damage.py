@@ -1,4 +1,4 @@
-"""Every fault of a bag is said in one sentence; what lies before it is read."""
+"""Every fault of a bag is reported in one sentence; the messages before it are read."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A single stamp that cannot be right costs its own scan and no other, whatever the recording's format."""
+"""A single wrong stamp costs its own scan and no other, in every format."""
 
 from collections.abc import Callable
 from dataclasses import replace

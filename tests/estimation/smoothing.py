@@ -10,7 +10,7 @@ from tests.experiments import bench_path  # noqa: F401
 from tests.imu.motion import quick_jit
 
 ROWS = 12
-"""Of most recordings: one program serves them all."""
+"""Number of rows in most recordings: one program serves all of them."""
 
 
 @quick_jit

@@ -87,7 +87,7 @@ def test_the_gradient_is_the_costs(name: str) -> None:
 
 
 def test_a_prediction_has_no_residual_and_its_errors_have_the_covariance() -> None:
-    """Of 2,000 links with biases that walk fast, so that the drift and its effect on the motion count."""
+    """For 2,000 links with biases that walk fast, so that the drift and its effect are visible."""
     fast = ImuParams(IMU.gyro_noise, IMU.accel_noise, jnp.array(0.2), jnp.array(2.0), IMU.gravity)
     recording = simulate(0, 2001, params=fast)
     truth, links = recording.truth, rows(recording.chain.imu, slice(None, -1))

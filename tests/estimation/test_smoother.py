@@ -33,7 +33,7 @@ def in_sigmas(result, others) -> float:
 
 
 def test_the_same_factors_give_gtsams_states_and_covariances():
-    """With biases that equal those of the preintegration, where gtsam's first-order correction is ours."""
+    """The biases equal those of the preintegration, where gtsam's first-order correction equals ours."""
     gtsam = pytest.importorskip("gtsam")
     from gtsam.symbol_shorthand import X
     from gtsam_chain import GtsamChain, covariance_of, states_of
@@ -86,7 +86,7 @@ def test_the_bound_on_iterations_is_reported(recording):
 
 
 def test_a_recording_shorter_than_the_rows(recording):
-    """Padding changes nothing, whatever it holds."""
+    """Padding changes nothing for any content."""
     short = simulate(0, ROWS)
     count = 7
     chain = eqx.tree_at(lambda c: c.count, short.chain, jnp.int32(count))

@@ -1,4 +1,4 @@
-"""Covariances tell the errors' true size, and a window follows gtsam's fixed-lag smoother."""
+"""Covariances are consistent with the errors, and a window agrees with gtsam's fixed-lag smoother."""
 
 import jax
 import jax.numpy as jnp

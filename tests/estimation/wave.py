@@ -22,7 +22,7 @@ PER_SCAN = 20
 MARGIN = 8
 """Samples before and after a scan that its batch holds too: room for the time offset."""
 POSE_SIGMA = jnp.array([0.005, 0.005, 0.005, 0.02, 0.02, 0.02])
-"""Of the lidar's pose, rad then m."""
+"""Standard deviations of the lidar's pose, rad then m."""
 IMU = ImuParams(
     gyro_noise=jnp.array(2e-3),
     accel_noise=jnp.array(2e-2),

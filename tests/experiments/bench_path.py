@@ -1,4 +1,4 @@
-"""Lets the tests import the benchmark's modules, which are scripts beside each other and no package."""
+"""Make the benchmark's modules importable in tests; they are scripts in one folder, not a package."""
 
 import sys
 from pathlib import Path

@@ -11,7 +11,7 @@ from lio_jax.data.sequence import LidarScan
 
 
 class Steady:
-    """Answers with the scan's number, two scans late where told; may fail or die at a scan."""
+    """Return the scan's number, on request two scans late; may fail or die at a scan."""
 
     def __init__(self, late: bool, fails_at: int, dies_at: int) -> None:
         self._fails_at, self._dies_at = fails_at, dies_at

@@ -66,7 +66,7 @@ def test_its_derivative_is_a_central_difference(solved, lag):
 
 
 def test_the_lag_is_the_filters():
-    """Its derivative and noise beside those by which the filter propagates a sweep's covariance."""
+    """The lag's derivative and noise agree with those by which the filter propagates a sweep's covariance."""
     recording = simulate(0, ROWS)
     whole, states = recording.intervals, recording.truth
     start = rows(states, 3)

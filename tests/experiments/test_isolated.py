@@ -35,7 +35,7 @@ def maker(late: bool = False, fails_at: int = NEVER, dies_at: int = NEVER, funct
 
 @pytest.fixture(scope="module")
 def outcomes(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Outcome], list[str]]:
-    """Of all kinds of systems in one run: starting processes is what takes time."""
+    """Return the outcomes of all kinds of systems from one run, because starting processes takes time."""
     path: Path = tmp_path_factory.mktemp("recording") / "short"
     write_native(path, (scan(number) for number in range(SCANS)))
     said: list[str] = []

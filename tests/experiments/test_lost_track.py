@@ -1,4 +1,4 @@
-"""Loss of track is told from drift."""
+"""Loss of track is distinguished from drift."""
 
 import numpy as np
 import pytest

@@ -44,9 +44,9 @@ class Truth:
 
     pose: jaxlie.SE3
     velocity: np.ndarray
-    """In world, m/s."""
+    """Velocity, world frame, m/s."""
     rate: np.ndarray
-    """In the body, rad/s."""
+    """Angular rate, body frame, rad/s."""
     force: np.ndarray
     """Specific force in the body, m/s^2."""
 

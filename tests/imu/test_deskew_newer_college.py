@@ -26,7 +26,7 @@ from lio_jax.imu.strapdown import path_along
 from tests.shared_data import SHARED_DATA, needs_shared
 
 SAMPLES = 9
-"""Of an IMU at 80 Hz, over a sweep of 0.1 s."""
+"""Number of samples of an IMU at 80 Hz in a sweep of 0.1 s."""
 FITTED = 800
 SIZE = 32768
 """All sweeps padded to it share one program."""

@@ -1,4 +1,4 @@
-"""A vehicle at rest tells gravity's direction and its biases; a moving one is found out."""
+"""A vehicle at rest shows gravity's direction and its biases; a moving vehicle is detected."""
 
 from collections.abc import Callable
 

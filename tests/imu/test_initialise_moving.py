@@ -161,7 +161,7 @@ NONE = (np.zeros(3), np.zeros(3))
 
 @MOTIONS
 def test_without_noise_and_bias_the_state_is_exact(initialise, motion):
-    """What is left is the error of samples taken at 200 Hz."""
+    """The remaining error comes from sampling at 200 Hz."""
     at = case(initialise, motion, biases=NONE)
     assert bool(at.found.is_good)
     bounds = ((ROTATION, 2e-4), (POSITION, 2e-4), (VELOCITY, 1e-3), (GYRO_BIAS, 1e-4), (ACCEL_BIAS, 2e-3))

@@ -129,7 +129,7 @@ def test_bias_jacobian_is_gtsams(turning: bool) -> None:
 
 @pytest.mark.parametrize(("turning", "change"), [(False, 0.02), (True, 0.0)])
 def test_prediction_is_gtsams(turning: bool, change: float) -> None:
-    """With other biases too, where gtsam corrects as we do: its G variant does it along the group instead."""
+    """Also with other biases, for which gtsam corrects as we do (its G variant corrects along the group)."""
     intervals = random_intervals(5)
     nav = dataclasses.replace(
         nav_at(0.7),

@@ -92,7 +92,7 @@ def test_the_transition_at_rest_is_finite_and_right(imu: ImuBatch) -> None:
 
 @pytest.mark.parametrize("row", [3, 10])
 def test_the_transition_of_the_time_offset_is_a_finite_difference(imu: ImuBatch, row: int) -> None:
-    """By differences of whole propagations, with noise on the samples so that the shift matters."""
+    """Compared with differences of whole propagations; noise on the samples makes the shift visible."""
     nav = state(ORIGIN).nav
     noisy = dataclasses.replace(imu, gyro=imu.gyro + jnp.sin(100.0 * jnp.arange(48))[:, None])
     h = 1e-6

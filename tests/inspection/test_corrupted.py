@@ -1,4 +1,4 @@
-"""An inspection tells what was done to a recording, and nothing of a healthy one."""
+"""An inspection finds the faults that were put into a recording, and none in a healthy one."""
 
 from dataclasses import replace
 

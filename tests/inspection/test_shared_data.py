@@ -1,4 +1,4 @@
-"""What an inspection says of the real recordings, and of files that are none."""
+"""Inspections of the real recordings, and of files that are not recordings."""
 
 import json
 

@@ -20,7 +20,7 @@ SCANS = 32
 
 @dataclass(frozen=True)
 class Walk:
-    """What is recorded."""
+    """The recorded data of a walk."""
 
     scans: tuple[LidarScan, ...]
     imu: ImuData | None

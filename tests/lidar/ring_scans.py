@@ -31,7 +31,7 @@ def config_of(**features) -> Config:
 
 
 def params_of(**leaves: float) -> Params:
-    """Return default parameters with values such as ``features__corner_threshold`` replaced."""
+    """Return default parameters with some values replaced, for example ``features__corner_threshold``."""
     values = {section: dict(entries) for section, entries in DEFAULTS.items()}
     for path, value in leaves.items():
         section, name = path.split("__")
@@ -101,7 +101,7 @@ def real_scans(name: str) -> Iterator[tuple[LidarScan, int]]:
 
 
 def _newer_college(folder: Path, number: int) -> LidarScan:
-    """Return a thinned sweep of an OS1-64: 64 beams about 0.53 deg apart, told by their elevation."""
+    """Return a thinned sweep of an OS1-64: 64 beams about 0.53 deg apart, recognised by their elevation."""
     points = np.fromfile(folder / f"raw_{number:02d}.bin", np.float32).reshape(-1, 3)
     time = np.fromfile(folder / f"times_{number:02d}.bin", np.float32)
     elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))

@@ -1,4 +1,4 @@
-"""What a solved pose graph has in common with gtsam's solution."""
+"""Compare a solved pose graph with gtsam's solution."""
 
 import gtsam
 import numpy as np

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 SPEED = 10.0
 LEVER = np.array([0.6, -0.4, 1.5])
 YAW, SHIFT = 2.1, np.array([40.0, -25.0, 7.0])
-"""Of the odometry's world in the receiver's frame."""
+"""Yaw (rad) and position (m) of the odometry's world in the receiver's frame."""
 
 
 @dataclass

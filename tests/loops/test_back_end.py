@@ -48,7 +48,7 @@ def loop(source: int, target: int, T_target_source: np.ndarray) -> Verdict:
 
 @dataclass
 class Found:
-    """Stands for a loop closer that finds what it is told to."""
+    """Replace a loop closer by one that returns given loops."""
 
     at: dict[int, Verdict]
     closed: list[Verdict] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""Loops one keyframe after the other: nothing is lost, and places that look alike are not confused."""
+"""Loops one keyframe after the other: none is lost, and similar places are not confused."""
 
 import numpy as np
 import pytest

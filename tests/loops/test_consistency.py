@@ -46,7 +46,7 @@ def test_right_loops_are_consistent_and_a_wrong_one_is_not(wrong):
 
 
 def test_two_equally_wrong_loops_are_consistent():
-    """All that a circle can tell: that is why loops are verified first."""
+    """A cycle of loops cannot show an error that both share: loops must be verified first."""
     shifted = [TRUTH[30] @ pose(5.0) @ np.linalg.inv(TRUTH[30])]
     pair = []
     for source, target in ((230, 30), (232, 32)):

@@ -1,4 +1,4 @@
-"""What speaks for and against an alignment, against plain definitions."""
+"""The evidence for and against an alignment, compared with plain definitions."""
 
 import numpy as np
 

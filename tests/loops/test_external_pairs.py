@@ -1,4 +1,4 @@
-"""Pairs of times from a text file: what is read, and what is said about lines that are wrong."""
+"""Pairs of times from a text file: the pairs that are read, and the messages on wrong lines."""
 
 import numpy as np
 import pytest

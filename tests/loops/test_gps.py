@@ -129,7 +129,7 @@ def test_without_elevation_the_height_is_that_of_the_corrected_antenna():
 
 
 def none_is_far_off(recorded, found):
-    """By no more than what is moved in a tenth of a second, half the time between two fixes."""
+    """No pose is off by more than the motion in 0.1 s, half the time between two fixes."""
     truth = to_enu(recorded.antennas())
     assert all(np.linalg.norm(found[number].position - truth[number]) < 1.1 for number in used(found))
 

@@ -40,7 +40,7 @@ def test_exact_fixes(yaw):
 
 
 def test_the_optimum_is_scipys():
-    """With covariances that are neither round nor alike."""
+    """The covariances are anisotropic and differ from fix to fix."""
     rng = np.random.default_rng(0)
     p = antennas()
     root = rng.normal(size=(len(p), 3, 3)) + 2 * np.eye(3)

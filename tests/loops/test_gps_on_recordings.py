@@ -1,4 +1,4 @@
-"""Fixes beside real odometry: what the gates leave, where it is put, what the graph makes of it."""
+"""Fixes with real odometry: the fixes that pass the gates, the alignment, and the graph's result."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +17,7 @@ from tests.shared_data import SHARED_DATA, needs_shared
 LEVER = np.array([-0.3, 0.4, 1.2])
 YAW, SHIFT = 2.1, np.array([300.0, -150.0, 12.0])
 UP = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""From KITTI's camera axes to forward, left, up."""
+"""Rotation from KITTI's camera axes to forward, left, up."""
 
 
 def kitti_poses(name):

@@ -1,4 +1,4 @@
-"""A place is told from others, with the turn and the side from which it is seen."""
+"""A place is recognised among others, with the yaw and the side from which it is seen."""
 
 import numpy as np
 import pytest

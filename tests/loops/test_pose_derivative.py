@@ -88,7 +88,7 @@ def test_gradient_by_all_weights(graph):
 
 
 def test_gradient_by_positions(graph):
-    """With a GPS-like position, whose own coordinates move the graph."""
+    """The graph has a GPS-like position, whose coordinates move its poses."""
     size, turning = graph.poses.tangent_dim, 3 if graph.poses.tangent_dim == 6 else 1
     information = np.zeros((2, size, size))
     information[:, turning:, turning:] = 20 * np.eye(size - turning)

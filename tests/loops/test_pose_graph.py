@@ -228,7 +228,7 @@ OPTIMA = {
 @needs_shared
 @pytest.mark.parametrize("name", OPTIMA)
 def test_recorded_graphs_reach_their_optimum(name):
-    """From edges alone; and where the file's guess leads there too, from that."""
+    """From edges alone, and also from the file's guess where it leads to the optimum."""
     graph = read_g2o(SHARED_DATA / "g2o" / f"{name}.g2o").graph
     solution = solve(graph)
     assert solution.status == "converged"

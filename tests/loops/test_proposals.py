@@ -1,4 +1,4 @@
-"""Which keyframes are compared: the nearest, the most alike, and both only where they may be."""
+"""The keyframes that are compared: the nearest ones and the most similar ones, where both are allowed."""
 
 import numpy as np
 import pytest

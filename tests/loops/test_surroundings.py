@@ -1,4 +1,4 @@
-"""What several keyframes saw together, thinned."""
+"""The thinned points of several keyframes together."""
 
 import numpy as np
 

@@ -23,7 +23,7 @@ SENSOR = spinning_lidar(16, 360, elevation_deg=(-15.0, 15.0))
 FIRST, AGAIN, SPACING = 40, 10, 2.0
 """Keyframes of the first pass and of the second, and the way between them, m."""
 WRONG = pose(6.0, -7.0, 0.5, 0.12)
-"""What the odometry has gathered between the passes, about the second one's end."""
+"""Drift of the odometry between the passes, at the second pass's end."""
 
 
 def straight(x, y, count, heading=1.0):

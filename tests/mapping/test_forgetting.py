@@ -1,4 +1,4 @@
-"""A table of fixed size on a long drive: what is near stays, what is far gives way, overflow is said."""
+"""A table of fixed size on a long drive: near voxels stay, far ones are replaced, overflow is reported."""
 
 import jax
 import numpy as np
@@ -63,7 +63,7 @@ def test_nothing_is_forgotten_while_there_is_room():
 
 
 def test_voxels_within_reach_are_never_lost():
-    """More voxels than slots, all within reach: the first stay, the later find no room, and that is said."""
+    """More voxels than slots, all within reach: the first stay, later ones find no room; it is reported."""
     rng = np.random.default_rng(2)
     vmap = empty_map(128)
     mine = np.unique(rng.integers(-6, 6, (90, 3)), axis=0)

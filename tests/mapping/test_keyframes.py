@@ -24,7 +24,7 @@ def pose(x: float, y: float = 0.0, yaw: float = 0.0) -> jaxlie.SE3:
 
 
 def cloud(number: int) -> KeyframeCloud:
-    """Return points that tell their keyframe, with gaps between them."""
+    """Return points that identify their keyframe, with gaps between them."""
     rng = np.random.default_rng(number)
     masks = rng.uniform(size=CORNERS) < 0.5, rng.uniform(size=SURFACES) < 0.7
     points = [rng.normal(size=(count, 3)).astype(np.float32) for count in (CORNERS, SURFACES)]

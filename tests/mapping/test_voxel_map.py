@@ -183,7 +183,7 @@ def test_of_many_points_in_a_cell_one_is_taken():
 
 
 def test_a_dense_scan_fills_each_cell_once():
-    """A wall hit by 20,000 points: its voxels hold 16 points, evenly spread, whatever the density."""
+    """A wall hit by 20,000 points: its voxels hold 16 evenly spread points each, for every density."""
     rng = np.random.default_rng(7)
     points = np.stack([np.full(20000, 0.65), *rng.uniform(-2.4, 2.4, (2, 20000))], -1)
     vmap = empty_map(1024)

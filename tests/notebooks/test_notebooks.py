@@ -27,7 +27,7 @@ def programs(tmp_path_factory):
 
 @pytest.fixture
 def kernel(tmp_path, monkeypatch, programs):
-    """What a kernel inherits: this installation's commands, no settings of the user's."""
+    """Set a kernel's environment: this installation's commands, and no settings of the user."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     environment = {
         "PATH": path,

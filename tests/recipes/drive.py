@@ -26,7 +26,7 @@ CONFIG = Config(
 )
 LIDAR = spinning_lidar(BEAMS, COLUMNS, elevation_deg=(-20.0, 15.0), range_sigma=0.01)
 TWIST = np.array([6.0, 0.3, 0.1, 0.02, -0.03, 0.3])
-"""Of the lidar in its own frame: m/s, then rad/s."""
+"""Twist of the lidar in its own frame: m/s, then rad/s."""
 
 
 def hall() -> World:
@@ -106,11 +106,11 @@ HALL = {
     "registration__point_spacing": 0.7,
     "registration__kernel": 0.2,
 }
-"""What differs from the defaults: the hall is small, and so are the capacities."""
+"""Settings that differ from the defaults: the hall is small, and so are the capacities."""
 
 
 def params_with(**paths: float | list[float]) -> Params:
-    """Return default parameters fit for the hall, with changes such as ``map__reach=50.0``."""
+    """Return default parameters fit for the hall, with changes, for example ``map__reach=50.0``."""
     values = {section: dict(leaves) for section, leaves in DEFAULTS.items()}
     for path, value in {**HALL, **paths}.items():
         section, name = path.split("__")
@@ -130,7 +130,7 @@ def initial(params: Params = PARAMS) -> State:
 
 @dataclass
 class Step:
-    """What one step returned."""
+    """The results of one step."""
 
     state: State
     output: Output

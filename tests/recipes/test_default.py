@@ -172,7 +172,7 @@ def test_output_is_the_imus_pose_and_velocity_where_the_lidar_is_mounted_askew()
 
 
 def test_output_points_lie_on_the_hall(drive):
-    """In world and motion compensated: without either they would be off by decimetres."""
+    """Points are in the world and motion compensated: without either they would be off by decimetres."""
     T_hall_world = lidar_pose(PERIOD / 2)
     for step in drive[4:]:
         output = step.output

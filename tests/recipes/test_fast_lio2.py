@@ -31,7 +31,7 @@ SMALL = [
 ]
 SCANS = 30
 MOVING = 10
-"""By then the drive has pulled away."""
+"""Number of scans after which the drive moves."""
 
 
 @cache

@@ -122,7 +122,7 @@ TRUE_NOISE = [
     "params.lidar.range_sigma=0.024",
     "params.registration.information_scale=0.34",
 ]
-"""Of the simulated IMU; the last two as tuning without truth finds them on such streets."""
+"""Values of the simulated IMU; the last two as tuning without truth finds them on such streets."""
 
 
 def test_the_pose_is_as_wrong_as_it_says():

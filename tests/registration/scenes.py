@@ -71,7 +71,7 @@ def sample(surfaces: list[Surface], count: int, sigma: float, seed: int, reach: 
 
 
 def params_with(**paths: float) -> Params:
-    """Return the default parameters with changes such as ``lidar__range_sigma=0.02``."""
+    """Return the default parameters with changes, for example ``lidar__range_sigma=0.02``."""
     values = {section: dict(leaves) for section, leaves in DEFAULTS.items()}
     for path, value in paths.items():
         section, name = path.split("__")

@@ -1,4 +1,4 @@
-"""Scenes that leave directions open: these keep the prediction and are said, the others are solved."""
+"""Scenes with unobservable directions: these keep the prediction and are reported, the others are solved."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from tests.registration.scenes import (
 from tests.registration.test_register import NOISE, PARAMS, POINTS, solve
 
 CORRIDOR = box_room(200.0, 9.0, 4.5)
-"""Its ends are out of sight: nothing tells the position along its axis, which lies at 0.2 rad."""
+"""A corridor with ends out of sight: the position along its axis, at 0.2 rad, is not observable."""
 DECIDED = params_with(lidar__range_sigma=0.03, registration__degeneracy_ratio=0.02)
 """A threshold well between the corridor's axis (0.004) and its next weakest direction (0.1)."""
 

@@ -214,7 +214,7 @@ def huber_loss(distance: np.ndarray, kernel: float) -> float:
 
 
 def test_the_gradient_is_that_of_hubers_loss():
-    """By central differences, in double precision."""
+    """Compared with central differences, in double precision."""
     matches, points, frames = some_matches()
     kernel, sigma = 0.1, 0.05
     equations = _linearise(matches, points, POSE, frames, jnp.float64(kernel), jnp.float64(sigma))
@@ -237,7 +237,7 @@ def test_the_gradient_is_that_of_hubers_loss():
 
 
 def test_the_hessian_is_that_of_the_weighted_distances():
-    """With a kernel that lets all through: J'J of the distances from planes and from a line's two planes."""
+    """With a kernel of weight 1: J'J of the distances from planes and from a line's two planes."""
     matches, points, frames = some_matches(1)
     equations = _linearise(matches, points, POSE, frames, jnp.float64(1e3), jnp.float64(1.0))
     rotation = np.asarray(POSE.rotation().as_matrix())

@@ -1,4 +1,4 @@
-"""Rows that are masked out count for nothing, whatever they hold: NaN and infinity included."""
+"""Rows that are masked out have no effect for any content, NaN and infinity included."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Registration in analytic scenes: known poses come back, and what cannot be known is said."""
+"""Registration in analytic scenes: known poses are found, and unobservable directions are reported."""
 
 from functools import partial
 
@@ -70,7 +70,7 @@ def test_known_pose_comes_back(scene, metres, degrees, prediction_error, seed):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_narrow_kernel_opens_as_wide_as_the_prediction_may_be_wrong(seed):
-    """From 1 m away 3 cm of kernel see outliers only, unless the prediction's error is admitted."""
+    """From 1 m away a kernel of 3 cm sees outliers only, unless it includes the prediction's error."""
     params = params_with(lidar__range_sigma=0.03, registration__kernel=0.03)
     start, points = perturbed(1.0, 3.0, seed), scan_of("room", seed + 1)
     admitted, denied = (solve(MAPS["room"], points, start, error, params) for error in (2.0, 0.01))

@@ -89,7 +89,7 @@ def test_an_update_that_is_not_finite_says_why_and_what_is_kept() -> None:
     nan = match(status=np.int32(NOT_FINITE), information=np.full((6, 6), np.nan))
     assert said(registration=nan, lost=True) == (
         "the update was not finite (the equations of its 300 matches hold NaN or infinity); state and "
-        "covariance are the prediction's, the map was left alone."
+        "covariance are the prediction's, the map was not changed."
     )
     assert "the filter's covariance overflowed" in said(
         registration=match(status=np.int32(NOT_FINITE)), lost=True

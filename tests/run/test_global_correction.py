@@ -1,4 +1,4 @@
-"""The back end beside a run: its files, its frame on the earth, and what happens where it fails."""
+"""The back end during a run: its files, its frame on the earth, and its failures."""
 
 import json
 
@@ -22,7 +22,7 @@ GPS_TIES_AT = ["params.gps.min_travel=2.0", "params.gps.spacing=1.0", "params.gp
 
 @pytest.fixture(scope="module")
 def recording():
-    """Return a drive with a receiver that is nearly exact, so that a few metres tell the heading."""
+    """Return a drive with an almost exact receiver, so that a few metres show the heading."""
     gps = GpsModel(noise=(0.02, 0.02, 0.02), multipath=0.0)
     return SimulatedSequence("street", duration_s=6.0, beams=16, columns=256, gps=gps, moving_start=True)
 

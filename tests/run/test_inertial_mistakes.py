@@ -1,4 +1,4 @@
-"""What recordings do to inertial samples: one clear sentence each, and an estimate that stays finite."""
+"""Faulty inertial samples: one clear sentence each, and an estimate that stays finite."""
 
 import re
 from collections.abc import Callable, Iterable
@@ -30,7 +30,7 @@ from tests.run.small_drive import without_points
 
 @dataclass
 class Replayed:
-    """A run's results and what it said."""
+    """A run's results and its messages."""
 
     tracked: list[ScanResult]
     warnings: list[str]

@@ -1,4 +1,4 @@
-"""Keyframes come back as they were written; what is missing or damaged is said."""
+"""Keyframes are read as they were written; missing and damaged files are reported."""
 
 import numpy as np
 import pytest
@@ -115,7 +115,7 @@ def test_no_keyframes(tmp_path):
 
 def test_parts_of_a_recipe_that_tells_none_apart(tmp_path):
     write(tmp_path, corner=False)
-    with pytest.raises(LioJaxError, match=r"told no corners from surfaces; take the part 'whole'"):
+    with pytest.raises(LioJaxError, match=r"separated no corners; take the part 'whole'"):
         read_keyframes(tmp_path).points(0, "corner")
 
 

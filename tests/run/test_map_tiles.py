@@ -84,7 +84,7 @@ def test_finer_maps_have_more_points_and_the_finest_all_of_them(tmp_path):
 
 
 def test_ten_kilometres_from_the_origin_a_millimetre_is_left(tmp_path):
-    """As much as single precision holds there; the thinning itself loses nothing."""
+    """A millimetre is the limit of single precision there; the thinning itself loses nothing."""
     [(T, points)] = clouds(1, 500)
     T[:3, 3] = [9000.0, -9000.0, 50.0]
     found, *_ = tiled(tmp_path, [(T, points)], 0.01)

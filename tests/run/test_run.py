@@ -1,4 +1,4 @@
-"""What a run leaves behind when things go wrong on the way."""
+"""The results of a run that meets errors on the way."""
 
 import json
 import threading

@@ -1,4 +1,4 @@
-"""Parameter files of LIO-SAM and FAST-LIO2: what each key becomes, and what is said of a wrong one."""
+"""Parameter files of LIO-SAM and FAST-LIO2: the effect of each key, and the message for a wrong one."""
 
 import numpy as np
 import pytest

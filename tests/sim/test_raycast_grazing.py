@@ -1,4 +1,4 @@
-"""Rays that only just meet or miss a surface: float32 cannot tell which, yet every range is exact."""
+"""Rays that barely meet or miss a surface: float32 cannot decide, yet every range is exact."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -19,7 +19,7 @@ from lio_jax.sim.worlds import counts_along, nearest_part
 REACH = 130.0
 
 RAYS = 2000
-"""As many in every cast, so that each world compiles once."""
+"""Number of rays in every cast; it is constant so that each world compiles once."""
 
 
 @cache

@@ -1,4 +1,4 @@
-"""From patterns to a vector of parameters and back."""
+"""Patterns select a vector of parameters, and the vector is written back."""
 
 import jax.numpy as jnp
 import numpy as np

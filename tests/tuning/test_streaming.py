@@ -24,9 +24,9 @@ STEPS = {
     "extrinsics": 1e-8,
     "": 1e-5,
 }
-"""Small where points move, lest they find another plane; large where hardly anything does."""
+"""Steps: small where points move, so that they keep their planes; large where the effect is small."""
 NOISE = 2e-10
-"""Of a total, because solves end at a step of 1e-12 and not of 0."""
+"""Noise as a share of a total: solves end at a step of 1e-12 and not of 0."""
 SMOOTHER_STEPS = {
     **STEPS,
     "imu.gyro_noise": 1e-2,

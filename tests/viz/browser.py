@@ -1,4 +1,4 @@
-"""Open a page in a headless Chromium and tell what the browser said, built, asked for and showed."""
+"""Open a page in a headless Chromium and return its messages, elements, requests and picture."""
 
 import asyncio
 import base64
@@ -39,7 +39,7 @@ _QUIET = (
 
 @dataclass(frozen=True)
 class Opened:
-    """What became of a page."""
+    """A page after it was opened."""
 
     console: list[str]
     """Lines that the page caused on the browser's console."""

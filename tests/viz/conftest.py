@@ -7,7 +7,7 @@ import pytest
 
 @pytest.fixture(scope="session")
 def pictures() -> Path:
-    """Return a folder that stays, beside the runs' own results and no part of the repository."""
+    """Return a folder that remains, apart from the runs' own results and outside the repository."""
     folder = Path(__file__).parents[2] / "out" / "test-pictures"
     folder.mkdir(parents=True, exist_ok=True)
     return folder

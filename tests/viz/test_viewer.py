@@ -39,7 +39,7 @@ def port_of(address: str) -> int:
 
 
 def listening(port: int) -> set[str]:
-    """Return the addresses at which somebody listens, hexadecimal as the kernel tells them."""
+    """Return the addresses that listen at a port, hexadecimal as the kernel prints them."""
     rows = [
         line.split()
         for table in ("tcp", "tcp6")
