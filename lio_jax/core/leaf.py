@@ -12,7 +12,7 @@ import inspect
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import equinox as eqx
@@ -121,12 +121,43 @@ def static(
     return dataclasses.field(default=default, metadata={_DECLARED: declared})
 
 
-def section(kind: type, **defaults: Any) -> Any:
+@dataclass(frozen=True)
+class _Section:
+    """Makes a section of a tree with its defaults."""
+
+    kind: type
+    own: dict[str, Any]
+    """Defaults in which the tree differs from the section's declarations."""
+
+    def default(self, name: str) -> Any:
+        """Return the default of a setting as plain value."""
+        return self.own.get(name, self.declared(name).default)
+
+    def declared(self, name: str) -> Declared:
+        """Return the declaration of a setting."""
+        return {field.name: field.metadata[_DECLARED] for field in self.fields()}[name]
+
+    def fields(self) -> tuple[dataclasses.Field[Any], ...]:
+        """Return the section's fields."""
+        return dataclasses.fields(self.kind)
+
+    def __call__(self) -> Any:
+        if not issubclass(self.kind, eqx.Module):
+            return self.kind(**self.own)
+        return _arrays(self.kind, {field.name: self.default(field.name) for field in self.fields()})
+
+
+def section(kind: type, **own: Any) -> Any:
     """Declare a section of a tree, with the defaults in which this tree differs from the section's own."""
-    unknown = set(defaults) - {field.name for field in dataclasses.fields(kind)}
+    unknown = set(own) - {field.name for field in dataclasses.fields(kind)}
     if unknown:
         raise TypeError(f"{kind.__name__} declares no {', '.join(sorted(unknown))}")
-    return dataclasses.field(default_factory=partial(kind, **defaults))
+    return dataclasses.field(default_factory=_Section(kind, own))
+
+
+def _arrays(kind: type, values: Mapping[str, Any]) -> Any:
+    """Return a section of traced parameters, from plain numbers."""
+    return kind(**{name: jnp.asarray(value, state_dtype()) for name, value in values.items()})
 
 
 @dataclass(frozen=True)
@@ -144,12 +175,16 @@ class Setting:
 
 
 def sections_of(tree: Any) -> dict[str, type]:
-    """Return the sections of a tree by name."""
+    """Return the classes of a tree's sections by name."""
+    return {name: made.kind for name, made in _sections(tree).items()}
+
+
+def _sections(tree: Any) -> dict[str, _Section]:
     sections = {}
     for place in dataclasses.fields(tree):
-        if place.default_factory is dataclasses.MISSING:
+        if not isinstance(place.default_factory, _Section):
             raise TypeError(f"{tree.__name__}.{place.name}: declare it by section(...)")
-        sections[place.name] = type(place.default_factory())
+        sections[place.name] = place.default_factory
     return sections
 
 
@@ -161,12 +196,10 @@ def settings_of(tree: Any) -> dict[str, Setting]:
         tree: a class whose fields are sections.
     """
     found: dict[str, Setting] = {}
-    defaults = tree()
-    for name, kind in sections_of(tree).items():
-        docs = _field_docs(kind)
-        for field in dataclasses.fields(kind):
-            default = getattr(getattr(defaults, name), field.name)
-            own = dataclasses.replace(field.metadata[_DECLARED], default=default)
+    for name, made in _sections(tree).items():
+        docs = _field_docs(made.kind)
+        for field in made.fields():
+            own = dataclasses.replace(made.declared(field.name), default=made.default(field.name))
             path = f"{name}.{field.name}"
             found[path] = Setting(path, own, field.type, docs.get(field.name, ""))
     return found
@@ -190,10 +223,9 @@ def traced(tree: type[T], values: Mapping[str, Mapping[str, Any]] | None = None)
         values: plain numbers by section and name, for at least the tree's sections. None: the defaults.
     """
     numbers = numbers_of(tree) if values is None else values
-    dtype = state_dtype()
     return tree(
         **{
-            name: kind(**{leaf: jnp.asarray(value, dtype) for leaf, value in numbers[name].items()})
+            name: _arrays(kind, {field.name: numbers[name][field.name] for field in dataclasses.fields(kind)})
             for name, kind in sections_of(tree).items()
         }
     )

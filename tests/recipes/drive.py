@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from lio_jax.core.types import Scan
-from lio_jax.lidar.params import LidarConfig
+from lio_jax.recipes.default_params import ThinnedScanConfig
 from lio_jax.mapping.params import MapConfig
 from lio_jax.recipes.default import Default, State
 from lio_jax.recipes.output import Output
@@ -21,7 +21,7 @@ from tests.params import DEFAULTS, Config, Params, params_from_values
 
 PERIOD, BEAMS, COLUMNS = 0.1, 16, 256
 CONFIG = Config(
-    lidar=LidarConfig(buckets=(BEAMS * COLUMNS,), registration_points=2048, insertion_points=4096),
+    lidar=ThinnedScanConfig(buckets=(BEAMS * COLUMNS,), registration_points=2048, insertion_points=4096),
     map=MapConfig(capacity=16384),
 )
 LIDAR = spinning_lidar(BEAMS, COLUMNS, elevation_deg=(-20.0, 15.0), range_sigma=0.01)
