@@ -16,6 +16,7 @@ from tyro.conf import Positional, arg
 from lio_jax.commands.sim_options import ErrorOptions, Format, MotionOptions, SensorOptions
 from lio_jax.commands.usage import usage_in_a_sentence
 from lio_jax.core.errors import LioJaxError, UsageError
+from lio_jax.tuning.objective_names import EXAMPLE, LISTED
 
 Assignments = Annotated[
     tuple[str, ...],
@@ -244,7 +245,9 @@ def tune(
     data: Positional[Annotated[tuple[Path, ...], arg(metavar="DATA [DATA ...]")]],
     params: Annotated[str, arg(metavar="GLOB,...")],
     out: Annotated[Path, arg(metavar="DIR")],
-    objective: Annotated[str, arg(metavar="NAME")] = "noise",
+    objective: Annotated[
+        str, arg(metavar="NAME", help=f"One of {LISTED}, or a sum such as {EXAMPLE}; marginal needs lio_sam.")
+    ] = "noise",
     recipe: Recipe = None,
     set_: Assignments = (),
     params_from: ParamsFrom = None,
@@ -265,8 +268,6 @@ def tune(
         data: Recordings to tune on.
         params: Parameters, such as imu.gyro_noise,imu.accel_noise or extrinsics.*.
         out: Folder for tuned.yaml, history.json and tuning.png; an earlier tuning there is gone on with.
-        objective: noise, pose, point, planes, marginal (lio_sam), map, ate, rpe, rpe-rotation, or a sum
-            such as ate+0.01*pose.
         recipe: Recipe or settings file to start from; None as for run.
         validate: Recordings that decide which iterate is taken and when to stop.
         gt: Ground truth of T_world_imu; None means the recordings' own.

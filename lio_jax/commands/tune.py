@@ -18,6 +18,7 @@ from lio_jax.core.settings import Settings
 from lio_jax.data.detect import open_sequence
 from lio_jax.run.run import settings_for
 from lio_jax.tuning.loss import Loss
+from lio_jax.tuning.objective_names import LIKELIHOODS, SHORT
 from lio_jax.tuning.objectives import Named, objective_named
 from lio_jax.tuning.optimise import Bounds
 from lio_jax.tuning.parameters import ParameterVector, free_parameters
@@ -68,7 +69,7 @@ def tune(
         optimiser = "scoring" if named.likelihood else "lbfgsb"
     if optimiser == "scoring" and not named.likelihood:
         raise UsageError(
-            "--optimizer scoring wants a likelihood (pose, point, planes, noise, marginal), "
+            f"--optimizer scoring wants a likelihood ({', '.join([*SHORT, *LIKELIHOODS])}), "
             f"not {options.objective}."
         )
     base = resolve_settings(options.recipe, options.assignments, options.params_from)

@@ -1,6 +1,7 @@
 """``lio-jax tune`` from end to end on a small simulated recording."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -12,6 +13,8 @@ from lio_jax.commands.run import resolve_settings
 from lio_jax.data.native_writer import write_native
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
+from lio_jax.tuning.objective_names import SHORT
+from lio_jax.tuning.objectives import _SINGLE, objective_named
 
 SMALL = [
     "--set",
@@ -22,6 +25,14 @@ SMALL = [
     "config.map.capacity=32768",
 ]
 PARAMS = ["--params", "imu.gyro_noise,lidar.range_sigma"]
+
+
+def test_the_help_lists_the_objectives_that_exist(capsys):
+    assert main(["tune", "--help"]) == 0
+    printed = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    listed = re.search(r"--objective NAME One of (.*?), or a sum such as (\S+);", printed)
+    assert set(listed[1].split(", ")) == {*_SINGLE, *SHORT}
+    objective_named(listed[2])
 
 
 @pytest.fixture(scope="module")
