@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import yaml
@@ -95,7 +95,7 @@ def tune(
     first = np.asarray(free.first())
     with _interruptible(session, out):
         session.run(optimiser, first, _bounds(free, first), options.iterations, options.seed)
-    _write(out, settings, free, session)
+    _write(out, base, free, session)
     print(_table(free, session))
     print(f"results    {out / 'tuned.yaml'} (use it as --recipe), {HISTORY}, tuning.png")
 
@@ -208,12 +208,27 @@ def _interval(free: ParameterVector, iterate: Iterate) -> dict[str, tuple[float,
     return intervals
 
 
-def _write(out: Path, settings: Settings, free: ParameterVector, session: Session) -> None:
+def tuned_settings(base: Settings, tuned: dict[str, Any]) -> dict[str, Any]:
+    """Return the tree of a settings file that repeats what was given and holds what was tuned.
+
+    What was taken from the recording is left out: a run takes it from its own recording.
+
+    Args:
+        base: settings as they were given, by a file, ``--params-from`` or ``--set``.
+        tuned: tuned values by their paths, such as ``params.imu.gyro_noise``.
+    """
+    given = base.as_dict()
+    tree: dict[str, Any] = {"recipe": base.recipe}
+    for path in sorted(base.given | tuned.keys()):
+        kind, section, name = path.split(".")
+        value = tuned[path] if path in tuned else given[kind][section][name]
+        tree.setdefault(kind, {}).setdefault(section, {})[name] = value
+    return tree
+
+
+def _write(out: Path, base: Settings, free: ParameterVector, session: Session) -> None:
     best = session.best
-    tree: dict = {"recipe": settings.recipe, "params": {}}
-    for path, value in free.overrides(np.asarray(best.x)).items():
-        _, section, name = path.split(".")
-        tree["params"].setdefault(section, {})[name] = value
+    tree = tuned_settings(base, free.overrides(np.asarray(best.x)))
     with atomic_path(out / "tuned.yaml") as aside:
         aside.write_text(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None))
     from lio_jax.viz.plot import plot_tuning

@@ -10,11 +10,13 @@ import yaml
 
 from lio_jax.cli import main
 from lio_jax.commands.run import resolve_settings
+from lio_jax.commands.tune import tuned_settings
 from lio_jax.data.native_writer import write_native
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
 from lio_jax.tuning.objective_names import SHORT
 from lio_jax.tuning.objectives import _SINGLE, objective_named
+from tests.data.foreign_files import LIO_SAM_ROS1
 
 SMALL = [
     "--set",
@@ -69,10 +71,28 @@ def test_a_tuning_leaves_settings_history_and_a_picture(recordings, tmp_path, ca
     assert tree["params"]["imu"]["gyro_noise"] == pytest.approx(np.exp(best["x"][0]))
     settings = resolve_settings(str(out / "tuned.yaml"), ())
     assert settings.values["lidar"]["range_sigma"] == pytest.approx(np.exp(best["x"][1]))
+    assert settings.config == resolve_settings(None, tuple(SMALL[1:])).config
 
     assert main([*words, "--iterations", "4"]) == 0
     assert "going on after 3 evaluations" in capsys.readouterr().err
     assert len(json.loads((out / "history.json").read_text())["iterates"]) == 4
+
+
+@pytest.mark.parametrize("theirs", [None, LIO_SAM_ROS1], ids=["ours", "theirs"])
+def test_the_tuned_file_repeats_what_was_given(tmp_path, theirs):
+    ours, params_from, out = tmp_path / "ours.yaml", None, tmp_path / "tuned.yaml"
+    ours.write_text("config: {map: {capacity: 32768}}\nparams: {imu: {accel_noise: 0.25}}")
+    if theirs:
+        params_from = tmp_path / "theirs.yaml"
+        params_from.write_text(theirs)
+    words = ("params.extrinsics.translation=[0.1,0.2,0.3]", "config.lidar.buckets=[4096]")
+    base = resolve_settings(str(ours), words, params_from)
+    tuned = {"params.imu.gyro_noise": 1.234567890123e-3, "params.imu.accel_noise": 0.5}
+    out.write_text(yaml.safe_dump(tuned_settings(base, tuned)))
+    expected = base
+    for path, value in tuned.items():
+        expected = expected.with_value(path, value, "test")
+    assert resolve_settings(str(out), ()) == expected
 
 
 @pytest.mark.parametrize(
