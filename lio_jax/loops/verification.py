@@ -8,7 +8,6 @@ that repeat themselves.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import equinox as eqx
@@ -17,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.param_values import DEFAULTS
-from lio_jax.core.params import Params, default_params
+from lio_jax.core.params import Params
 from lio_jax.core.settings import Settings
 from lio_jax.core.types import state_dtype
 from lio_jax.loops.alignment import aligned
@@ -65,7 +63,8 @@ def verify(proposal: Proposal, keyframes: Sequence[Keyframe], poses: _Array, set
         proposal: which two keyframes.
         keyframes: all so far.
         poses: (k, 4, 4) their T_world_imu, corrected so far.
-        settings: ``config.loops`` and ``params.loop``.
+        settings: the run's. ``config.loops`` and ``params.loop`` say what is compared and accepted; the
+            points are aligned with ``params.lidar``, ``params.map`` and ``params.registration``.
     """
     limits, sizes = settings.values["loop"], settings.config.loops
     source, target = proposal.source, proposal.target
@@ -101,7 +100,7 @@ def verify(proposal: Proposal, keyframes: Sequence[Keyframe], poses: _Array, set
         *padded(ours, sizes.source_points),
         _guesses(found, stations),
         sizes.starts,
-        _params(limits["aligning_voxel"], state_dtype()),
+        _aligning_params(settings),
     )
     comparison = Comparison(theirs, stations, ours[our_upright], limits["overlap_distance"])
     candidates = comparison.candidates(result, poses[[target, source]])
@@ -110,7 +109,7 @@ def verify(proposal: Proposal, keyframes: Sequence[Keyframe], poses: _Array, set
     def conflicting(T: _Array) -> float:
         return conflict(seen, theirs[their_upright], T)
 
-    return _judged(proposal, candidates, conflicting, poses[[target, source]], limits)
+    return _judged(proposal, candidates, conflicting, poses[[target, source]], settings)
 
 
 def _judged(
@@ -118,8 +117,9 @@ def _judged(
     candidates: list[Candidate],
     conflicting: Callable[[_Array], float],
     poses: _Array,
-    limits: dict[str, Any],
+    settings: Settings,
 ) -> Verdict:
+    limits = settings.values["loop"]
     error = possible_error(proposal.metres, limits)
     if not candidates:
         return refused(proposal, "the points could not be aligned")
@@ -161,7 +161,7 @@ def _judged(
     to_body = np.kron(np.eye(2), poses[1, :3, :3])
     information = np.zeros((6, 6))
     if not reason:
-        information = _believed(to_body.T @ best.information @ to_body, limits)
+        information = _believed(to_body.T @ best.information @ to_body, settings.values)
     left, right = np.eye(4), np.eye(4)
     left[:3, :3], right[:3, :3] = poses[0, :3, :3].T, poses[1, :3, :3]
     return Verdict(
@@ -182,9 +182,9 @@ def refused(proposal: Proposal, reason: str) -> Verdict:
     return Verdict(proposal, False, reason, proposal.T_target_source, np.zeros((6, 6)))
 
 
-def _believed(information: _Array, limits: dict[str, Any]) -> _Array:
+def _believed(information: _Array, values: dict[str, dict[str, Any]]) -> _Array:
     """Return the information that is left where neighbouring points share the map's error."""
-    scale = DEFAULTS["registration"]["information_scale"]
+    scale, limits = values["registration"]["information_scale"], values["loop"]
     sigmas = np.repeat([limits["rotation_sigma"], limits["translation_sigma"]], 3)
     believed = np.linalg.inv(np.linalg.inv(scale * information) + np.diag(sigmas**2))
     return (believed + believed.T) / 2
@@ -213,11 +213,10 @@ def _guesses(found: Fits, targets: _Array) -> _Array:
     return guesses
 
 
-@cache
-def _params(voxel_size: float, dtype: jnp.dtype) -> Params:
-    """Return parameters of the alignment, which is the same whatever the recipe."""
-    size = jnp.asarray(voxel_size, dtype)
-    return eqx.tree_at(lambda params: params.map.voxel_size, default_params(), size)
+def _aligning_params(settings: Settings) -> Params:
+    """Return the run's parameters with the voxels that places are aligned with."""
+    size = jnp.asarray(settings.values["loop"]["aligning_voxel"], state_dtype())
+    return eqx.tree_at(lambda params: params.map.voxel_size, settings.params(), size)
 
 
 def _wrapped(angle: float) -> float:
