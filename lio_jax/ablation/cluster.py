@@ -51,7 +51,6 @@ def on_this_machine(most: int) -> Iterator[Workers]:
     Args:
         most: of the workers that have something to do.
     """
-    _check_installed()
     import dask
     from distributed import Client, Scheduler, SpecCluster
 
@@ -151,7 +150,6 @@ def at_scheduler(address: str) -> Iterator[Workers]:
     Raises:
         UsageError: no scheduler answers at the address, or it has no workers.
     """
-    _check_installed()
     from distributed import Client
 
     logger = logging.getLogger("distributed")
@@ -211,10 +209,3 @@ def _cores_with_memory() -> int:
     import psutil  # distributed needs it too
 
     return min(len(os.sched_getaffinity(0)), int(psutil.virtual_memory().available) // _WORKER_BYTES)
-
-
-def _check_installed() -> None:
-    if importlib.util.find_spec("distributed") is None:
-        raise LioJaxError(
-            "lio-jax ablate needs dask.distributed, which is not installed: pip install 'lio-jax[cluster]'."
-        )
