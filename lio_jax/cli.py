@@ -7,6 +7,7 @@ import os
 import re
 import sys
 import traceback
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -209,8 +210,8 @@ def export(
         to: Format.
         out: What to write: *.bag (ROS 1), *.mcap or *.db3 (ROS 2); else a folder.
         layout: Make of the LiDAR whose messages a bag gets: velodyne, ouster or livox.
-        start: First scan.
-        scans: How many scans; None means all.
+        start: First scan. Inertial samples, GPS fixes and truth are written from a second before it.
+        scans: How many scans; None means all. Samples, fixes and truth end a second after the last one.
         overwrite: Replace the recording that is there.
     """
     from lio_jax.commands.export import export as command
@@ -372,6 +373,9 @@ def main(argv: list[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
     try:
+        if words[:1] == ["--version"]:
+            print(f"lio-jax {version('lio-jax')}")
+            return 0
         words = _gathered([word for word in words if word != "--debug"])
         with usage_in_a_sentence(words, app):
             app.cli(args=words, prog="lio-jax", description=_DESCRIPTION)
@@ -392,7 +396,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 _DESCRIPTION = (
-    "Differentiable LiDAR-inertial odometry. Add --debug to any command for the traceback of an error."
+    "Differentiable LiDAR-inertial odometry. --version prints the version. Add --debug to any command for "
+    "the traceback of an error."
 )
 
 
