@@ -45,11 +45,6 @@ TIME = "scan_ms.total.median"
 """What a scan costs."""
 
 
-def is_timing(metric: str) -> bool:
-    """Return whether a metric differs from run to run on one machine."""
-    return METRICS.get(metric) in ("ms", "s")
-
-
 def numbers_in(metrics: Mapping[str, Any]) -> dict[str, float]:
     """Return the numbers of a metrics.json by the names above."""
     flat = {"failed_scans": float(len(metrics.get("failures", ())))}
