@@ -7,6 +7,7 @@ import os
 import re
 import sys
 import traceback
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,6 +17,7 @@ from tyro.conf import Positional, arg
 from lio_jax.commands.sim_options import ErrorOptions, Format, MotionOptions, SensorOptions
 from lio_jax.commands.usage import usage_in_a_sentence
 from lio_jax.core.errors import LioJaxError, UsageError
+from lio_jax.tuning.objective_names import EXAMPLE, LISTED
 
 Assignments = Annotated[
     tuple[str, ...],
@@ -208,9 +210,9 @@ def export(
         to: Output format.
         out: Output: *.bag (ROS 1), *.mcap or *.db3 (ROS 2); else a folder.
         layout: Make of the LiDAR whose messages a bag gets: velodyne, ouster or livox.
-        start: First scan.
-        scans: Number of scans; None means all.
-        overwrite: Replace an existing recording.
+        start: First scan. Inertial samples, GPS fixes and truth are written from a second before it.
+        scans: How many scans; None means all. Samples, fixes and truth end a second after the last one.
+        overwrite: Replace the recording that is there.
     """
     from lio_jax.commands.export import export as command
 
@@ -244,7 +246,9 @@ def tune(
     data: Positional[Annotated[tuple[Path, ...], arg(metavar="DATA [DATA ...]")]],
     params: Annotated[str, arg(metavar="GLOB,...")],
     out: Annotated[Path, arg(metavar="DIR")],
-    objective: Annotated[str, arg(metavar="NAME")] = "noise",
+    objective: Annotated[
+        str, arg(metavar="NAME", help=f"One of {LISTED}, or a sum such as {EXAMPLE}; marginal needs lio_sam.")
+    ] = "noise",
     recipe: Recipe = None,
     set_: Assignments = (),
     params_from: ParamsFrom = None,
@@ -265,8 +269,6 @@ def tune(
         data: Recordings to tune on.
         params: Parameters, for example imu.gyro_noise,imu.accel_noise or extrinsics.*.
         out: Folder for tuned.yaml, history.json and tuning.png; an earlier tuning there is continued.
-        objective: noise, pose, point, planes, marginal (lio_sam), map, ate, rpe, rpe-rotation, or a sum
-            for example ate+0.01*pose.
         recipe: Recipe or settings file to start from; None as for run.
         validate: Recordings that decide which iterate is taken and when to stop.
         gt: Ground truth of T_world_imu; None means the recordings' own.
@@ -371,6 +373,9 @@ def main(argv: list[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
     try:
+        if words[:1] == ["--version"]:
+            print(f"lio-jax {version('lio-jax')}")
+            return 0
         words = _gathered([word for word in words if word != "--debug"])
         with usage_in_a_sentence(words, app):
             app.cli(args=words, prog="lio-jax", description=_DESCRIPTION)
@@ -391,7 +396,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 _DESCRIPTION = (
-    "Differentiable LiDAR-inertial odometry. Add --debug to any command for the traceback of an error."
+    "Differentiable LiDAR-inertial odometry. --version prints the version. Add --debug to any command for "
+    "the traceback of an error."
 )
 
 

@@ -2,8 +2,10 @@
 
 import ast
 import os
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -122,6 +124,25 @@ def test_the_rule_can_see_an_upward_import(tmp_path, monkeypatch):
         "from lio_jax.core.types import Scan\nfrom .config import Config\nimport numpy"
     )
     assert violations(core / "good.py") == []
+
+
+MODULE_OF = {"rerun-sdk": "rerun", "pyyaml": "yaml", "lazy-loader": "lazy_loader"}
+"""Modules that are not called as the package that brings them."""
+BROUGHT_ALONG = {"dask", "psutil"}
+"""Modules that a dependency needs itself: both come with distributed."""
+
+
+def test_what_the_package_imports_is_installed_with_it():
+    with (PACKAGE.parent / "pyproject.toml").open("rb") as file:
+        declared = tomllib.load(file)["project"]["dependencies"]
+    names = {re.split(r"[<>=]", one)[0] for one in declared}
+    brought = {MODULE_OF.get(name, name) for name in names}
+    used = {"lazy_loader"}
+    for path in FILES:
+        tree, is_package = ast.parse(path.read_text()), path.name == "__init__.py"
+        used |= {name.split(".")[0] for name in imported(tree, module_name(path), is_package)}
+    used -= {"lio_jax", *sys.stdlib_module_names}
+    assert used - brought == BROUGHT_ALONG
 
 
 def run_python(code: str) -> subprocess.CompletedProcess:

@@ -54,7 +54,6 @@ def on_this_machine(most: int) -> Iterator[Workers]:
     Args:
         most: largest number of workers that have work to do.
     """
-    _check_installed()
     import dask
     from distributed import Client, Scheduler, SpecCluster
 
@@ -154,7 +153,6 @@ def at_scheduler(address: str) -> Iterator[Workers]:
     Raises:
         UsageError: no scheduler answers at the address, or it has no workers.
     """
-    _check_installed()
     from distributed import Client
 
     logger = logging.getLogger("distributed")
@@ -214,10 +212,3 @@ def _cores_with_memory() -> int:
     import psutil  # distributed needs it too
 
     return min(len(os.sched_getaffinity(0)), int(psutil.virtual_memory().available) // _WORKER_BYTES)
-
-
-def _check_installed() -> None:
-    if importlib.util.find_spec("distributed") is None:
-        raise LioJaxError(
-            "lio-jax ablate needs dask.distributed, which is not installed: pip install 'lio-jax[cluster]'."
-        )

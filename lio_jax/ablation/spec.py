@@ -45,11 +45,6 @@ TIME = "scan_ms.total.median"
 """Metric for the time of a scan."""
 
 
-def is_timing(metric: str) -> bool:
-    """Return whether a metric differs between equal runs on one machine."""
-    return METRICS.get(metric) in ("ms", "s")
-
-
 def numbers_in(metrics: Mapping[str, Any]) -> dict[str, float]:
     """Return the numbers of a metrics.json by the paths of METRICS."""
     flat = {"failed_scans": float(len(metrics.get("failures", ())))}

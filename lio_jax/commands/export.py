@@ -18,6 +18,7 @@ from lio_jax.data.detect import open_sequence
 from lio_jax.data.kitti_writer import write_kitti
 from lio_jax.data.native_writer import write_native
 from lio_jax.data.sequence import LidarScan, Sequence
+from lio_jax.data.span import Span
 from lio_jax.data.trajectory import write_tum
 from lio_jax.data.whole_output import written_whole
 from lio_jax.run.run import check_start
@@ -45,11 +46,12 @@ def export(
         raise UsageError(f"--start must be 0 or more and --scans 1 or more, not {start} and {scans}.")
     config = resolve_settings("default", assignments).run.data
     bag_format = _bag_format(out, to)
-    sequence = open_sequence(data, config)
+    sequence: Sequence = open_sequence(data, config)
     check_start(sequence, start)
     for note in sequence.info.notes:
         say(f"note: {note}")
-    streamed = _with_progress(sequence, start, scans)
+    sequence = Span(sequence, start, scans)
+    streamed = _with_progress(sequence)
     first = next(streamed, None)
     if first is None:
         raise LioJaxError(f"{data}: no scan could be read. {' '.join(sequence.warnings_so_far)}".strip())
@@ -143,10 +145,8 @@ def _reading_hint(to: Target, first: LidarScan) -> str:
     return ""
 
 
-def _with_progress(sequence: Sequence, start: int, count: int | None) -> Iterator[LidarScan]:
-    remaining = max(0, sequence.info.scan_count - start)
-    total = remaining if count is None else min(count, remaining)
-    with tqdm(total=total, unit="scan", disable=None, leave=False) as bar:
-        for scan in sequence.scans(start, count):
+def _with_progress(sequence: Sequence) -> Iterator[LidarScan]:
+    with tqdm(total=sequence.info.scan_count, unit="scan", disable=None, leave=False) as bar:
+        for scan in sequence.scans():
             yield scan
             bar.update()

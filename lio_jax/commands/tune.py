@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import yaml
@@ -18,6 +18,7 @@ from lio_jax.data.detect import open_sequence
 from lio_jax.run.run import settings_for
 from lio_jax.settings.settings import Settings
 from lio_jax.tuning.loss import Loss
+from lio_jax.tuning.objective_names import LIKELIHOODS, SHORT
 from lio_jax.tuning.objectives import Named, objective_named
 from lio_jax.tuning.optimise import Bounds
 from lio_jax.tuning.parameters import ParameterVector, free_parameters
@@ -68,7 +69,7 @@ def tune(
         optimiser = "scoring" if named.likelihood else "lbfgsb"
     if optimiser == "scoring" and not named.likelihood:
         raise UsageError(
-            "--optimizer scoring wants a likelihood (pose, point, planes, noise, marginal), "
+            f"--optimizer scoring wants a likelihood ({', '.join([*SHORT, *LIKELIHOODS])}), "
             f"not {options.objective}."
         )
     base = resolve_settings(options.recipe, options.assignments, options.params_from)
@@ -94,7 +95,7 @@ def tune(
     first = np.asarray(free.first())
     with _interruptible(session, out):
         session.run(optimiser, first, _bounds(free, first), options.iterations, options.seed)
-    _write(out, settings, free, session)
+    _write(out, base, free, session)
     print(_table(free, session))
     print(f"results    {out / 'tuned.yaml'} (use it as --recipe), {HISTORY}, tuning.png")
 
@@ -207,12 +208,27 @@ def _interval(free: ParameterVector, iterate: Iterate) -> dict[str, tuple[float,
     return intervals
 
 
-def _write(out: Path, settings: Settings, free: ParameterVector, session: Session) -> None:
+def tuned_settings(base: Settings, tuned: dict[str, Any]) -> dict[str, Any]:
+    """Return the tree of a settings file that repeats what was given and holds what was tuned.
+
+    What was taken from the recording is left out: a run takes it from its own recording.
+
+    Args:
+        base: settings as they were given, by a file, ``--params-from`` or ``--set``.
+        tuned: tuned values by their paths, such as ``params.imu.gyro_noise``.
+    """
+    given = base.as_dict()
+    tree: dict[str, Any] = {"recipe": base.recipe}
+    for path in sorted(base.given | tuned.keys()):
+        kind, section, name = path.split(".")
+        value = tuned[path] if path in tuned else given[kind][section][name]
+        tree.setdefault(kind, {}).setdefault(section, {})[name] = value
+    return tree
+
+
+def _write(out: Path, base: Settings, free: ParameterVector, session: Session) -> None:
     best = session.best
-    tree: dict = {"recipe": settings.recipe, "params": {}}
-    for path, value in free.overrides(np.asarray(best.x)).items():
-        _, section, name = path.split(".")
-        tree["params"].setdefault(section, {})[name] = value
+    tree = tuned_settings(base, free.overrides(np.asarray(best.x)))
     with atomic_path(out / "tuned.yaml") as aside:
         aside.write_text(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None))
     from lio_jax.viz.plot import plot_tuning

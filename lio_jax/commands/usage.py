@@ -87,7 +87,7 @@ def _wrong_command(words: Sequence[str], commands: Mapping[str, Any]) -> str:
     if not words:
         return f"give a command, one of {listed}; --help explains them."
     if words[0].startswith("-"):
-        option = _nearest_option(words[0], _EVERYWHERE)
+        option = _nearest_option(words[0], (*_EVERYWHERE, "--version"))
         meant = f"did you mean {option}?" if option else f"give a command first, one of {listed}."
         return f"unknown option '{words[0]}'; {meant}"
     close = difflib.get_close_matches(words[0], commands, 1)

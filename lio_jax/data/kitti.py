@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.timestamps import seconds_to_ns
 from lio_jax.data.config import DataConfig
+from lio_jax.data.reader import Reader
 from lio_jax.data.reconstruct import KITTI_START_AZIMUTH, azimuth_time
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo, WarningLog
 from lio_jax.data.time_order import Stamped, ascending, in_time_order
@@ -206,3 +207,11 @@ def pose_files(path: Path) -> list[Path]:
     """Return the places where a sequence's true poses may be stored; the first that exists is read."""
     path = path.resolve()
     return [path / "poses.txt", path.parent.parent / "poses" / f"{path.name}.txt"]
+
+
+READER = Reader(
+    "kitti_odometry",
+    "a KITTI odometry sequence (velodyne/*.bin)",
+    lambda path: (path / "velodyne").is_dir(),
+    KittiSequence,
+)

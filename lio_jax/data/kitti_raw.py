@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data.config import DataConfig
 from lio_jax.data.enu import geodetic_to_enu, mercator_positions
+from lio_jax.data.reader import Reader
 from lio_jax.data.reconstruct import KITTI_START_AZIMUTH, azimuth_time
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo, WarningLog
 from lio_jax.data.time_order import Stamped, ascending, in_time_order
@@ -290,3 +291,11 @@ class KittiRawSequence:
             return np.asarray(np.linalg.inv(T_lidar_imu), np.float64)
         except (KeyError, ValueError, np.linalg.LinAlgError):
             raise LioJaxError(f"{path}: needs the entries R (9 numbers) and T (3 numbers); fix it.") from None
+
+
+READER = Reader(
+    "kitti_raw",
+    "a KITTI raw drive (velodyne_points/data)",
+    lambda path: (path / "velodyne_points").is_dir(),
+    KittiRawSequence,
+)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data.config import DataConfig
 from lio_jax.data.pointcloud2 import valid_returns
+from lio_jax.data.reader import Reader
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo, WarningLog
 from lio_jax.data.time_order import Stamped, in_time_order
 from lio_jax.data.trajectory import Trajectory, read_tum
@@ -165,3 +166,11 @@ def _read_meta(path: Path) -> dict[str, Any]:
         "sensor": str(meta.get("sensor") or ""),
         "name": str(meta.get("name") or ""),
     }
+
+
+READER = Reader(
+    "native",
+    "a native folder (meta.yaml and scans/)",
+    lambda path: (path / "meta.yaml").is_file(),
+    NativeSequence,
+)

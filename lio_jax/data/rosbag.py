@@ -27,6 +27,7 @@ from lio_jax.data.bag_scans import decode_cloud, recognise_scans
 from lio_jax.data.config import DataConfig
 from lio_jax.data.imu_checks import accel_scale
 from lio_jax.data.navigation_messages import GpsCollector, ImuCollector
+from lio_jax.data.reader import Reader, entries
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo, WarningLog
 from lio_jax.data.static_transforms import frame_name, gathered, transform_between
 from lio_jax.data.time_order import Stamped, in_time_order
@@ -307,3 +308,25 @@ class RosbagSequence:
 def _size(path: Path) -> int:
     files = [path] if path.is_file() else path.iterdir()
     return sum(file.stat().st_size for file in files if file.is_file())
+
+
+BAG_SUFFIXES = (".bag", ".db3", ".mcap")
+"""Endings of files that are read as bags."""
+
+
+def _is_bag(path: Path) -> bool:
+    if path.is_file():
+        is_bag = path.suffix in BAG_SUFFIXES or path.name == "metadata.yaml"
+        return is_bag or path.name.endswith(".bag.active")
+    if (path / "metadata.yaml").is_file():
+        return True
+    return any(entry.suffix in BAG_SUFFIXES for entry in entries(path))
+
+
+READER = Reader(
+    "rosbag",
+    "a ROS 2 bag folder (metadata.yaml) or a bag file (.bag, .db3, .mcap)",
+    _is_bag,
+    RosbagSequence,
+    has_parts=False,
+)

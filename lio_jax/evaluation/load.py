@@ -90,7 +90,7 @@ def _kitti_stamps(path: Path, count: int) -> NDArray[np.int64] | None:
 
 
 def _bag_suffixes() -> tuple[str, ...]:
-    from lio_jax.data.detect import BAG_SUFFIXES
+    from lio_jax.data.rosbag import BAG_SUFFIXES
 
     return BAG_SUFFIXES
 

@@ -253,6 +253,17 @@ def initialise_moving(
 ) -> MovingStart:
     """Return the state at the last of n + 1 poses that agrees with the samples of the n spans between them.
 
+    It is for a recording that starts in motion, where a mean of the accelerometer does not show gravity. The
+    recipes do not use it. Match ten scans without the samples, stack one batch of samples for each span
+    between two scans, and call, for scans 0.1 s apart whose ends are the batches' time 0::
+
+        found = lio_jax.initialise_moving(
+            imu, -0.1 * jnp.ones(9), jnp.zeros(9), T_world_lidar, params.imu, params.initial, T_imu_lidar,
+            time_offset=jnp.array(0.0), rotation_sigma=jnp.array(1e-3), translation_sigma=jnp.array(0.01),
+        )
+        if found.is_good:
+            nav = found.start.nav
+
     The accelerometer's bias is weakly observable, and only as far as the vehicle turns; its prior keeps it
     near zero. With ten poses over one second the error of the level is about the accelerometer's bias over
     gravity.

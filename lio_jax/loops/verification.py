@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.leaf import numbers_of, traced
-from lio_jax.core.types import state_dtype
 from lio_jax.loops.alignment import aligned
 from lio_jax.loops.keyframe import Keyframe, level_points, padded, thinned
 from lio_jax.loops.overlap import LEAST_POINTS, Candidate, Comparison, conflict
@@ -109,7 +108,7 @@ def verify(
         *padded(ours, sizes.source_points),
         _guesses(found, stations),
         sizes.starts,
-        _params(limits["aligning_voxel"], state_dtype()),
+        _aligning_params(settings),
     )
     comparison = Comparison(theirs, stations, ours[our_upright], limits["overlap_distance"])
     candidates = comparison.candidates(result, poses[[target, source]])

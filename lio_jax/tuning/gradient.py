@@ -38,7 +38,7 @@ def gradient(
     Args:
         sequence: the recording.
         patterns: parameters by name or glob, such as ``imu.*_noise``.
-        objective: by name (noise, pose, point, planes, marginal, map, ate, rpe, sums of them) or one's own.
+        objective: by name (see :mod:`lio_jax.tuning.objective_names`), a sum of them, or one's own.
         settings: recipe, config and params; None: the default recipe's.
         truth: in place of the recording's own.
         start: first scan.

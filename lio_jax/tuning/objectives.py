@@ -17,6 +17,7 @@ from lio_jax.lidar.range_scatter import range_scatter
 from lio_jax.recipes.output import Evidence
 from lio_jax.recipes.params import RecipeParams as Params
 from lio_jax.registration.point_evidence import PointEvidence
+from lio_jax.tuning.objective_names import EXAMPLE, LISTED, SHORT
 
 
 class TruePose(eqx.Module):
@@ -323,8 +324,6 @@ _SINGLE = {
     "rpe": Named(RelativeError(), True, False),
     "rpe-rotation": Named(RelativeError(rotation=True), True, False),
 }
-_SHORT = {"noise": "pose+ranges"}
-"""What is called by a name of its own."""
 
 
 def objective_named(text: str) -> Named:
@@ -333,14 +332,13 @@ def objective_named(text: str) -> Named:
     Raises:
         UsageError: a name is not known (lists those there are), or a weight is no number.
     """
-    terms = _SHORT.get(text, text).split("+")
+    terms = SHORT.get(text, text).split("+")
     parts, weights = [], []
     for term in terms:
         weight, star, name = term.rpartition("*")
         if name.strip() not in _SINGLE:
-            names = ", ".join([*_SINGLE, *_SHORT])
             raise UsageError(
-                f"objective '{name.strip()}' is not known; there are: {names}, and sums like ate+0.01*pose."
+                f"objective '{name.strip()}' is not known; there are: {LISTED}, and sums such as {EXAMPLE}."
             )
         try:
             weights.append(float(weight) if star else 1.0)

@@ -9,9 +9,6 @@ import threading
 import time
 from pathlib import Path
 
-import pytest
-
-pytest.importorskip("distributed", reason="dask.distributed is not installed")
 import psutil
 
 from tests.ablation import trivial

@@ -11,7 +11,7 @@ from lio_jax.ablation import perform as performing
 from lio_jax.ablation.batch import BatchPrograms, run_batch
 from lio_jax.ablation.perform import perform
 from lio_jax.ablation.results import gathered
-from lio_jax.ablation.spec import METRICS, is_timing, load_spec
+from lio_jax.ablation.spec import METRICS, load_spec
 from lio_jax.ablation.store import DiskError, opened
 from lio_jax.ablation.tasks import tasks_of
 from lio_jax.commands.runtime import prepare_jax
@@ -21,7 +21,8 @@ from lio_jax.run.track import CompiledStep, Programs, scan_inputs, track
 from tests.ablation.drives import DRIVE, SMALL, write_spec
 from tests.full_disk import full_disk_after
 
-COLUMNS = [name for name in METRICS if not is_timing(name)]
+COLUMNS = [name for name, unit in METRICS.items() if unit not in ("ms", "s")]
+"""What does not differ from run to run on one machine."""
 
 
 def performed(root, tasks):

@@ -11,10 +11,6 @@ import time
 from html.parser import HTMLParser
 from pathlib import Path
 
-import pytest
-
-pytest.importorskip("distributed", reason="dask.distributed is not installed")
-
 from lio_jax.ablation import cluster
 from lio_jax.core.files import folder_lock
 from tests.ablation.drives import DRIVE, write_spec
@@ -216,16 +212,6 @@ def test_a_specification_on_a_full_disk(cli, tmp_path):
         done = cli("ablate", spec, "--out", tmp_path / "out")
     assert done.status == 1
     assert f"{tmp_path / 'out' / 'spec.yaml'}: cannot be written" in done.err
-
-
-def test_without_dask(cli, tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster.importlib.util, "find_spec", lambda name: None)
-    done = cli("ablate", write_spec(tmp_path / "spec.yaml"), "--out", tmp_path / "out")
-    assert done.status == 1
-    assert done.err.splitlines()[-1] == (
-        "lio-jax: lio-jax ablate needs dask.distributed, which is not installed: "
-        "pip install 'lio-jax[cluster]'."
-    )
 
 
 def test_ctrl_c(tmp_path, program_cache):

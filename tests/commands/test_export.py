@@ -2,12 +2,18 @@
 
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from lio_jax.data.config import DataConfig
 from lio_jax.data.detect import open_sequence
+from lio_jax.data.native_writer import write_native
 from lio_jax.data.trajectory import read_tum
+from lio_jax.run.scan_inputs import ImuFeed
+from lio_jax.sim.gps import GpsModel
+from lio_jax.sim.imu import ImuModel
+from lio_jax.sim.sequence import SimulatedSequence
 
 SCANS = 4
 
@@ -42,8 +48,9 @@ def test_a_bag_holds_the_scans_and_has_the_truth_beside_it(cli, folder, original
         np.testing.assert_array_equal(one.points, other.points)
         np.testing.assert_array_equal(one.ring, other.ring)
         np.testing.assert_allclose(one.time, other.time, atol=2e-6)
-    truth = read_tum(tmp_path / "drive.truth.tum")
-    np.testing.assert_allclose(truth.poses, original[0].truth().poses, atol=1e-6)
+    truth, whole = read_tum(tmp_path / "drive.truth.tum"), original[0].truth()
+    np.testing.assert_allclose(truth.poses, whole.poses[: len(truth)], atol=1e-6)
+    assert truth.stamp_ns[-1] >= scans[-1].end_ns - 1000
 
 
 def test_a_native_folder_is_the_same_recording(cli, folder, original, tmp_path):
@@ -55,7 +62,36 @@ def test_a_native_folder_is_the_same_recording(cli, folder, original, tmp_path):
         assert one.stamp_ns == other.stamp_ns
         np.testing.assert_array_equal(one.points, other.points)
         np.testing.assert_array_equal(one.time, other.time)
-    np.testing.assert_allclose(sequence.truth().poses, original[0].truth().poses, atol=1e-9)
+    whole, truth = original[0].truth(), sequence.truth()
+    places = np.searchsorted(whole.stamp_ns, truth.stamp_ns)
+    np.testing.assert_allclose(truth.poses, whole.poses[places], atol=1e-9)
+
+
+def test_a_part_holds_the_samples_of_its_own_time(cli, tmp_path):
+    whole = SimulatedSequence(duration_s=5.0, beams=16, columns=128, imu=ImuModel(), gps=GpsModel())
+    source, out = tmp_path / "whole", tmp_path / "part"
+    parts = {"imu": whole.imu(), "gps": whole.gps(), "truth": whole.truth()}
+    write_native(source, whole.scans(), T_imu_lidar=whole.info.T_imu_lidar, **parts)
+    assert cli("export", source, "--to", "native", "--out", out, "--start", 20, "--scans", 4).status == 0
+    sequence, scans = read(out)
+    before, scans_before = read(source)
+    begin, end = scans_before[20].stamp_ns - 1e9, scans_before[23].end_ns + 1e9
+    for part, all_of_it in (
+        (sequence.imu(), before.imu()),
+        (sequence.gps(), before.gps()),
+        (sequence.truth(), before.truth()),
+    ):
+        kept = (all_of_it.stamp_ns >= begin) & (all_of_it.stamp_ns <= end)
+        assert 0 < kept.sum() < len(kept)
+        np.testing.assert_array_equal(part.stamp_ns, all_of_it.stamp_ns[kept])
+    # the estimator gets the same samples as from the whole recording
+    part_feed, whole_feed = (ImuFeed(one.imu(), (64, 256, 1024)) for one in (sequence, before))
+    last_end = scans_before[19].end_ns
+    for number, scan in enumerate(scans):
+        own, same = scans_before[20 + number], np.testing.assert_array_equal
+        jax.tree.map(same, part_feed.before(scan), whole_feed.before(own))
+        jax.tree.map(same, part_feed.batch(scan, last_end), whole_feed.batch(own, last_end))
+        last_end = scan.end_ns
 
 
 def test_a_kitti_sequence_keeps_points_rings_times_and_poses(cli, folder, original, tmp_path):

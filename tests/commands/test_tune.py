@@ -1,6 +1,7 @@
 """``lio-jax tune`` from end to end on a small simulated recording."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -9,9 +10,13 @@ import yaml
 
 from lio_jax.cli import main
 from lio_jax.commands.run import resolve_settings
+from lio_jax.commands.tune import tuned_settings
 from lio_jax.data.native_writer import write_native
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
+from lio_jax.tuning.objective_names import SHORT
+from lio_jax.tuning.objectives import _SINGLE, objective_named
+from tests.data.foreign_files import LIO_SAM_ROS1
 
 SMALL = [
     "--set",
@@ -22,6 +27,14 @@ SMALL = [
     "config.map.capacity=32768",
 ]
 PARAMS = ["--params", "imu.gyro_noise,lidar.range_sigma"]
+
+
+def test_the_help_lists_the_objectives_that_exist(capsys):
+    assert main(["tune", "--help"]) == 0
+    printed = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    listed = re.search(r"--objective NAME One of (.*?), or a sum such as (\S+);", printed)
+    assert set(listed[1].split(", ")) == {*_SINGLE, *SHORT}
+    objective_named(listed[2])
 
 
 @pytest.fixture(scope="module")
@@ -58,10 +71,28 @@ def test_a_tuning_leaves_settings_history_and_a_picture(recordings, tmp_path, ca
     assert tree["params"]["imu"]["gyro_noise"] == pytest.approx(np.exp(best["x"][0]))
     settings = resolve_settings(str(out / "tuned.yaml"), ())
     assert settings.values["lidar"]["range_sigma"] == pytest.approx(np.exp(best["x"][1]))
+    assert settings.config == resolve_settings(None, tuple(SMALL[1:])).config
 
     assert main([*words, "--iterations", "4"]) == 0
     assert "continuing after 3 evaluations" in capsys.readouterr().err
     assert len(json.loads((out / "history.json").read_text())["iterates"]) == 4
+
+
+@pytest.mark.parametrize("theirs", [None, LIO_SAM_ROS1], ids=["ours", "theirs"])
+def test_the_tuned_file_repeats_what_was_given(tmp_path, theirs):
+    ours, params_from, out = tmp_path / "ours.yaml", None, tmp_path / "tuned.yaml"
+    ours.write_text("config: {map: {capacity: 32768}}\nparams: {imu: {accel_noise: 0.25}}")
+    if theirs:
+        params_from = tmp_path / "theirs.yaml"
+        params_from.write_text(theirs)
+    words = ("params.extrinsics.translation=[0.1,0.2,0.3]", "config.lidar.buckets=[4096]")
+    base = resolve_settings(str(ours), words, params_from)
+    tuned = {"params.imu.gyro_noise": 1.234567890123e-3, "params.imu.accel_noise": 0.5}
+    out.write_text(yaml.safe_dump(tuned_settings(base, tuned)))
+    expected = base
+    for path, value in tuned.items():
+        expected = expected.with_value(path, value, "test")
+    assert resolve_settings(str(out), ()) == expected
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """A command line that cannot be understood gives one sentence, which names what comes nearest."""
 
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Annotated, Literal
 
 import pytest
@@ -37,7 +38,8 @@ WRONG = {
     "rn a": "unknown command 'rn'; did you mean 'run'?",
     "fly": "unknown command 'fly'; the commands are {commands}.",
     "--hepl": "unknown option '--hepl'; did you mean --help?",
-    "--version": "unknown option '--version'; give a command first, one of {commands}.",
+    "--verison": "unknown option '--verison'; did you mean --version?",
+    "--x": "unknown option '--x'; give a command first, one of {commands}.",
 }
 
 
@@ -49,6 +51,11 @@ def test_one_sentence_and_status_2(cli, line):
     assert done.status == 2
     assert done.out == ""
     assert done.err == f"lio-jax: {WRONG[line].format(commands=', '.join(app._subcommands))}\n"
+
+
+def test_the_version_is_that_of_the_package(cli):
+    done = cli("--version")
+    assert (done.status, done.out, done.err) == (0, f"lio-jax {version('lio-jax')}\n", "")
 
 
 def test_debug_adds_the_traceback(cli):

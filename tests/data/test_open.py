@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data import open_sequence, write_native
+from lio_jax.data import detect, native, open_sequence, write_native
+from lio_jax.data.config import DataConfig
+from lio_jax.data.reader import Reader
 from tests.data.test_native import scans
 from tests.shared_data import SHARED_DATA, needs_shared
 
@@ -30,6 +32,30 @@ def test_real_recordings_find_their_reader(path: str, kind: str) -> None:
 def test_a_native_folder_finds_its_reader(tmp_path: Path) -> None:
     write_native(tmp_path / "s", scans(1))
     assert open_sequence(str(tmp_path / "s")).info.format == "native"
+
+
+def _renamed(path: Path, config: DataConfig) -> native.NativeSequence:
+    (path / "other.yaml").rename(path / "meta.yaml")
+    return native.NativeSequence(path, config)
+
+
+def test_a_new_reader_is_one_entry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = tmp_path / "all" / "recording"
+    write_native(recording, scans(1))
+    (recording / "meta.yaml").rename(recording / "other.yaml")
+    reader = Reader("other", "another folder (other.yaml)", lambda p: (p / "other.yaml").is_file(), _renamed)
+    with pytest.raises(LioJaxError, match="the layout is not known"):
+        open_sequence(recording)
+    monkeypatch.setattr(detect, "READERS", (*detect.READERS, reader))
+    assert len(list(open_sequence(recording).scans())) == 1
+    (recording / "meta.yaml").rename(recording / "other.yaml")
+    with pytest.raises(LioJaxError, match="one of those inside it: recording"):
+        open_sequence(recording.parent)
+    with pytest.raises(LioJaxError, match="is a part of a recording"):
+        open_sequence(recording / "scans")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(LioJaxError, match=r"the folder is empty; give .*another folder \(other\.yaml\)"):
+        open_sequence(tmp_path / "empty")
 
 
 def test_nothing_there_is_an_error() -> None:

@@ -10,7 +10,7 @@ from simulated_keyframes import driven, keyframes_of, times_along
 
 from lio_jax.loops.proposals import external_proposal
 from lio_jax.loops.verification import verify
-from lio_jax.settings.settings import Settings
+from lio_jax.settings.settings import Settings, recipe_settings
 from lio_jax.sim.assembly import assembled
 from lio_jax.sim.blocks import LANE, lap
 from lio_jax.sim.lidar import spinning_lidar
@@ -84,7 +84,33 @@ def test_a_place_seen_again_is_accepted_with_its_pose(again):
     assert np.all((sigma[3:] >= LIMITS["translation_sigma"]) & (sigma[3:] < 0.5))
 
 
-def test_another_place_is_refused_for_any_error_of_the_odometry():
+def test_the_settings_of_the_run_count():
+    """A scale of 1 in place of 0.03 takes all points as independent, a larger range noise all as worse."""
+    keyframes, truth, odometry = city("same way")
+    proposal = proposed(keyframes, truth, odometry, nearest(truth), 500.0)
+    verdict = verify(proposal, keyframes, odometry, SETTINGS)
+    sure = SETTINGS.with_value("params.registration.information_scale", 1.0, "test")
+    surer = verify(proposal, keyframes, odometry, sure)
+    floor = np.repeat([LIMITS["rotation_sigma"], LIMITS["translation_sigma"]], 3) ** 2
+    of_points = np.diag(np.linalg.inv(verdict.information)) - floor
+    np.testing.assert_allclose(
+        np.diag(np.linalg.inv(surer.information)) - floor, 0.03 * of_points, rtol=1e-3, atol=1e-12
+    )
+    blunt = SETTINGS.with_value("params.lidar.range_sigma", 0.5, "test")
+    assert not np.array_equal(verify(proposal, keyframes, odometry, blunt).information, verdict.information)
+
+
+@pytest.mark.parametrize("recipe", ["fast_lio2", "loam", "lio_sam"])
+@pytest.mark.parametrize("again", ["same way", "other lane", "another street"])
+def test_every_recipe_accepts_the_same_places(again, recipe):
+    keyframes, truth, odometry = city(again)
+    target = 10 if again == "another street" else nearest(truth)
+    proposal = proposed(keyframes, truth, odometry, target, 500.0)
+    verdict = verify(proposal, keyframes, odometry, recipe_settings(recipe))
+    assert verdict.accepted == (again != "another street"), verdict.reason
+
+
+def test_another_place_is_refused_whatever_the_odometry_would_allow():
     keyframes, truth, odometry = city("another street")
     for target in (10, 25):
         proposal = proposed(keyframes, truth, odometry, target, 1e5)

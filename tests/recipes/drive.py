@@ -10,9 +10,9 @@ import numpy as np
 from scipy.linalg import expm
 
 from lio_jax.core.types import Scan
-from lio_jax.recipes.default_params import ThinnedScanConfig
 from lio_jax.mapping.params import MapConfig
 from lio_jax.recipes.default import Default, State
+from lio_jax.recipes.default_params import ThinnedScanConfig
 from lio_jax.recipes.output import Output
 from lio_jax.sim.assembly import assembled
 from lio_jax.sim.lidar import column_times, spinning_lidar, sweep

@@ -12,6 +12,7 @@ from lio_jax.core.errors import UsageError
 from lio_jax.core.types import initial_nav_state
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.evaluation.evaluate import evaluate
+from lio_jax.tuning import objective_names, objectives
 from lio_jax.tuning.objectives import (
     AbsoluteError,
     MarginalLikelihood,
@@ -124,9 +125,17 @@ def test_sums_of_objectives_by_name():
     assert objective_named("noise").likelihood
 
 
+def test_the_listed_names_are_those_of_the_objectives():
+    assert set(objectives._SINGLE) == set(objective_names.SINGLE)
+    likelihoods = {name for name, named in objectives._SINGLE.items() if named.likelihood}
+    assert likelihoods == set(objective_names.LIKELIHOODS)
+    for text in (*objective_names.SHORT, objective_names.EXAMPLE):
+        objective_named(text)
+
+
 @pytest.mark.parametrize("text", ["atte", "ate+rpf", "x*ate"])
 def test_an_unknown_objective_lists_those_there_are(text):
-    with pytest.raises(UsageError, match=r"there are: pose|is no number"):
+    with pytest.raises(UsageError, match=r"there are: noise, pose|is no number"):
         objective_named(text)
 
 
