@@ -19,24 +19,14 @@ PICTURES = {
 }
 
 
-@pytest.fixture(scope="module")
-def programs(tmp_path_factory):
-    """One cache of compiled programs for all notebooks and the commands that they run."""
-    return os.environ.get("LIO_JAX_CACHE") or str(tmp_path_factory.getbasetemp() / "programs")
-
-
 @pytest.fixture
-def kernel(tmp_path, monkeypatch, programs):
+def kernel(tmp_path, monkeypatch):
     """What a kernel inherits: this installation's commands, no settings of the user's."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     environment = {
         "PATH": path,
         "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
         "IPYTHONDIR": str(tmp_path / "ipython"),
-        "LIO_JAX_CACHE": programs,
-        "JAX_COMPILATION_CACHE_DIR": programs,
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
     }
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
