@@ -36,7 +36,8 @@ for _name, _value in _KEEP_PROGRAMS.items():
 # lio_jax.core.types, because the runner fills a Scan with numpy arrays, and the host-side packages, because
 # their protocols are not runtime_checkable.
 _CHECKED = (
-    "core.config core.files core.geometry core.hashing core.params core.settings "
+    "core.config core.error_state core.files core.geometry core.hashing core.implicit core.params "
+    "core.prefix_sum core.settings "
     "imu lidar mapping registration estimation loops recipes sim"
 )
 install_import_hook([f"lio_jax.{name}" for name in _CHECKED.split()], f"{type_checker.__name__}.checked")
