@@ -4,13 +4,22 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test lint bench settings clean
+.PHONY: demo test test-all test-long lint bench settings clean
 
 demo: $(VENV)/.installed
 	$(BIN)/lio-jax demo --out out/demo --overwrite
 
+# a file's tests stay in one process: they share drives and programs
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile
+
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n 4 --dist loadfile
+	$(PYTEST) -m "not long"
+
+test-long: $(VENV)/.installed-dev
+	$(PYTEST) -m long --durations=20
+
+test-all: $(VENV)/.installed-dev
+	$(PYTEST) --durations=20
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -1,6 +1,7 @@
 """The house's rules: imports only go down, importing changes nothing and says nothing."""
 
 import ast
+import importlib
 import os
 import re
 import subprocess
@@ -143,6 +144,75 @@ def test_what_the_package_imports_is_installed_with_it():
         used |= {name.split(".")[0] for name in imported(tree, module_name(path), is_package)}
     used -= {"lio_jax", *sys.stdlib_module_names}
     assert used - brought == BROUGHT_ALONG
+
+
+MODULES = {module_name(path): path for path in FILES}
+MOST_MODULES = 250
+"""A reader has to find a way among them: a new one earns its place, or one goes."""
+
+
+def modules_imported(module: str) -> set[str]:
+    """Return the package's modules that one of them names in its imports, those within functions too."""
+    path, found = MODULES[module], set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if not isinstance(node, ast.Import | ast.ImportFrom):
+            continue
+        for base in imported(node, module, path.name == "__init__.py"):
+            # what is taken from a package may be a module of it
+            parts = {f"{base}.{alias.name}" for alias in node.names} & set(MODULES)
+            found |= parts or {base} & set(MODULES)
+    return found - {module}
+
+
+def cycle_in(graph: dict[str, set[str]]) -> list[str]:
+    """Return the names along one cycle, or none."""
+    done: set[str] = set()
+    for start in graph:
+        path, open_names = [start], [iter(sorted(graph[start]))]
+        while path:
+            following = next((name for name in open_names[-1] if name not in done), None)
+            if following is None:
+                done.add(path.pop())
+                open_names.pop()
+            elif following in path:
+                return [*path[path.index(following) :], following]
+            else:
+                path.append(following)
+                open_names.append(iter(sorted(graph[following])))
+    return []
+
+
+def test_no_module_imports_itself_by_way_of_others():
+    assert cycle_in({module: modules_imported(module) for module in MODULES}) == []
+
+
+def test_the_rule_can_see_a_cycle():
+    assert cycle_in({"a": {"b", "d"}, "b": {"c"}, "c": {"a"}, "d": set()}) == ["a", "b", "c", "a"]
+    assert cycle_in({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
+    assert "lio_jax.core.types" in modules_imported("lio_jax.recipes.recipe")
+
+
+def test_there_are_not_too_many_modules():
+    modules = [module for module, path in MODULES.items() if path.name != "__init__.py"]
+    assert len(modules) <= MOST_MODULES
+
+
+PUBLIC = [
+    (node.module or "", alias.asname or alias.name)
+    for node in ast.parse((PACKAGE / "__init__.pyi").read_text()).body
+    if isinstance(node, ast.ImportFrom)
+    for alias in node.names
+]
+
+
+@pytest.mark.parametrize(("module", "name"), PUBLIC)
+def test_every_public_name_is_there(module, name):
+    if module:
+        defined = getattr(importlib.import_module(f"lio_jax.{module}"), name)
+    else:
+        defined = importlib.import_module(f"lio_jax.{name}")
+    assert getattr(lio_jax, name) is defined
+    assert name in lio_jax.__all__
 
 
 def run_python(code: str) -> subprocess.CompletedProcess:

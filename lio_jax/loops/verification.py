@@ -108,7 +108,7 @@ def verify(
         *padded(ours, sizes.source_points),
         _guesses(found, stations),
         sizes.starts,
-        _aligning_params(settings),
+        _params(limits["aligning_voxel"], state_dtype()),
     )
     comparison = Comparison(theirs, stations, ours[our_upright], limits["overlap_distance"])
     candidates = comparison.candidates(result, poses[[target, source]])

@@ -13,6 +13,8 @@ import psutil
 
 from tests.ablation import trivial
 
+pytestmark = pytest.mark.long
+
 KILLS_OF_WORKERS, KILLS_OF_COMMANDS = 15, 6
 
 

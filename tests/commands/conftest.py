@@ -1,6 +1,6 @@
-"""The command line in this process: one cache of compiled programs for all of its tests."""
+"""The command line in this process, and a recording for it."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,7 +8,6 @@ import pytest
 
 from lio_jax.cli import main
 from tests.run import small_drive
-from tests.run.program_cache import kept_programs
 
 
 @dataclass(frozen=True)
@@ -21,12 +20,6 @@ class Done:
 
 
 Cli = Callable[..., Done]
-
-
-@pytest.fixture(scope="package", autouse=True)
-def program_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    with kept_programs(tmp_path_factory.getbasetemp() / "programs") as cache:
-        yield cache
 
 
 @pytest.fixture

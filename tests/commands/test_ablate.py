@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -177,8 +178,9 @@ def test_a_folder_of_something_else(cli, tmp_path):
     assert "holds something else than an ablation" in done.err
 
 
-def test_a_full_disk(tmp_path, program_cache):
-    """Workers take the limit over from the command; compiled programs are there from the tests before."""
+def test_a_full_disk(tmp_path):
+    """Workers take the limit over from the command, and cut off the programs that they keep."""
+    programs = shutil.copytree(os.environ["LIO_JAX_CACHE"], tmp_path / "programs")
     code = (
         "import sys\n"
         "from lio_jax.cli import main\n"
@@ -191,7 +193,7 @@ def test_a_full_disk(tmp_path, program_cache):
     done = subprocess.run(
         [sys.executable, "-c", code, "ablate", str(spec), "--out", str(out)],
         cwd=SMOKE.parents[2],
-        env={**os.environ, "LIO_JAX_CACHE": str(program_cache)},
+        env={**os.environ, "LIO_JAX_CACHE": str(programs), "JAX_COMPILATION_CACHE_DIR": str(programs)},
         capture_output=True,
         text=True,
         check=False,
@@ -214,7 +216,7 @@ def test_a_specification_on_a_full_disk(cli, tmp_path):
     assert f"{tmp_path / 'out' / 'spec.yaml'}: cannot be written" in done.err
 
 
-def test_ctrl_c(tmp_path, program_cache):
+def test_ctrl_c(tmp_path):
     spec = write_spec(
         tmp_path / "spec.yaml", grid={"params.map.voxel_size": [0.7 + 0.01 * n for n in range(90)]}
     )
@@ -224,7 +226,6 @@ def test_ctrl_c(tmp_path, program_cache):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "LIO_JAX_CACHE": str(program_cache)},
         # a terminal sends the signal to the workers as well
         start_new_session=True,
         # a shell makes what it starts in the background ignore the signal

@@ -1,7 +1,6 @@
 """Ctrl-C and faults in the middle: what was computed is written, whole."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -107,7 +106,7 @@ def test_bug_in_the_middle(cli, tmp_path, monkeypatch):
     _check_complete(tmp_path / "out", 5)
 
 
-def test_ctrl_c_on_a_real_process(tmp_path, program_cache):
+def test_ctrl_c_on_a_real_process(tmp_path):
     """Interrupt once the map's spool has begun to grow."""
     many = islice(cycle(standing()), SCANS)
     data = write_folder(
@@ -120,7 +119,6 @@ def test_ctrl_c_on_a_real_process(tmp_path, program_cache):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "LIO_JAX_CACHE": str(program_cache)},
         # a shell makes what it starts in the background ignore the signal
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )

@@ -1,6 +1,5 @@
 """The program as a shell sees it: exit status, streams, help, tracebacks only when asked for."""
 
-import os
 import subprocess
 import sys
 
@@ -10,14 +9,13 @@ from lio_jax.commands.runtime import prepare_jax
 from tests.commands.conftest import PLAIN
 
 
-def _shell(*words, cache=None):
-    environment = {**os.environ, **({"LIO_JAX_CACHE": str(cache)} if cache else {})}
+def _shell(*words):
     command = [sys.executable, "-m", "lio_jax.cli", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120)
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
 
 
-def test_run_is_quiet_when_piped(folder, tmp_path, program_cache):
-    done = _shell("run", folder, "--scans", 3, *PLAIN, "--out", tmp_path / "out", cache=program_cache)
+def test_run_is_quiet_when_piped(folder, tmp_path):
+    done = _shell("run", folder, "--scans", 3, *PLAIN, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert done.stderr == "note: T_imu_lidar: from the recording's calibration.\n"
     assert done.stdout.startswith("scans      3  (")

@@ -21,6 +21,8 @@ from lio_jax.estimation.iterated_filter import CONVERGED
 from lio_jax.evaluation.consistency import average_band, nees
 from tests.estimation import wave
 
+pytestmark = pytest.mark.long
+
 RUNS, SCANS = 64, 100
 PARTS = {
     "rotation": (ROTATION, 0.02),

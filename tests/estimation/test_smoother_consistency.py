@@ -16,6 +16,7 @@ from simulated_chain import GRAVITY, rows, simulate  # isort: skip
 RUNS = 200
 
 
+@pytest.mark.long
 def test_the_average_error_is_that_of_the_covariances():
     recordings = [simulate(seed, ROWS) for seed in range(1000, 1000 + RUNS)]
     for name, k in (("middle", ROWS // 2), ("end", ROWS - 1)):
@@ -34,6 +35,7 @@ def test_the_average_error_is_that_of_the_covariances():
             assert low < sum(values) < high, (name, part, sum(values) / dof)
 
 
+@pytest.mark.long
 def test_a_window_that_forgets_stays_consistent():
     """The latest of the states, when most of the run has been marginalised."""
     capacity, runs = 4, 100

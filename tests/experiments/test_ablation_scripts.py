@@ -15,14 +15,14 @@ from tests.run.small_drive import moving, write_kitti
 ROOT = Path(__file__).parents[2]
 
 
-def script(name, *words, cache=None):
+def script(name, *words):
     return subprocess.run(
         [sys.executable, str(ROOT / "experiments" / name), *map(str, words)],
         capture_output=True,
         text=True,
         check=False,
         cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT), **({"LIO_JAX_CACHE": str(cache)} if cache else {})},
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
 
 

@@ -19,24 +19,14 @@ PICTURES = {
 }
 
 
-@pytest.fixture(scope="module")
-def programs(tmp_path_factory):
-    """One cache of compiled programs for all notebooks and the commands that they run."""
-    return os.environ.get("LIO_JAX_CACHE") or str(tmp_path_factory.getbasetemp() / "programs")
-
-
 @pytest.fixture
-def kernel(tmp_path, monkeypatch, programs):
+def kernel(tmp_path, monkeypatch):
     """Set a kernel's environment: this installation's commands, and no settings of the user."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     environment = {
         "PATH": path,
         "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
         "IPYTHONDIR": str(tmp_path / "ipython"),
-        "LIO_JAX_CACHE": programs,
-        "JAX_COMPILATION_CACHE_DIR": programs,
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
     }
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
@@ -59,6 +49,7 @@ def test_a_notebook_is_kept_without_outputs(path):
         assert cell.get("execution_count") is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs_from_a_clean_kernel(path, tmp_path, kernel):
     """A cell that raises, or a command that fails, fails the test."""

@@ -10,9 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.types import Scan
-from lio_jax.recipes import recipe_named
-from lio_jax.recipes.default import Default, State
-from lio_jax.recipes.output import Output
+from lio_jax.recipes.default import Default
 from lio_jax.registration.gauss_newton import CONVERGED, TOO_FEW_MATCHES
 from tests.recipes.drive import (
     CONFIG,
@@ -330,40 +328,6 @@ def test_a_full_map_is_reported_and_nothing_else_breaks():
         missing = int(step.output.points_mask.sum() - step.output.added.sum())
         assert step.output.map_dropped <= missing
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(step.state))
-
-
-def test_repeats_bit_for_bit(drive):
-    again = run([scan(number) for number in range(SCANS)])
-    for one, other in zip(drive, again, strict=True):
-        assert leaves_equal(one.state, other.state)
-        assert leaves_equal(one.output, other.output)
-
-
-def test_precision_is_single_for_points_and_double_for_states(drive):
-    """Points and maps stay float32 on their whole way; navigation follows the x64 flag."""
-    step = drive[-1]
-    kinds = {str(leaf.dtype) for leaf in jax.tree.leaves(step.state.map)}
-    assert kinds <= {"float32", "int32", "uint32"}
-    assert step.output.points.dtype == jnp.float32
-    for leaf in jax.tree.leaves((step.state.nav, step.state.T_world_lidar, step.state.twist)):
-        assert leaf.dtype == jnp.float64
-    assert step.output.registration.information.dtype == jnp.float64
-    assert step.output.origin.dtype == jnp.float64
-
-
-def test_state_keeps_its_shapes_and_types(drive):
-    def form(state):
-        return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), state)
-
-    assert form(initial()) == form(drive[0].state) == form(drive[-1].state)
-
-
-def test_recipe_is_found_by_its_name():
-    recipe = recipe_named("default")(CONFIG)
-    assert isinstance(recipe, Default)
-    state, output = jax.eval_shape(recipe.step, PARAMS, initial(), scan(0))
-    assert isinstance(state, State)
-    assert isinstance(output, Output)
 
 
 def test_one_program_served_all_of_it():

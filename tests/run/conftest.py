@@ -1,22 +1,10 @@
 """One compiled step and one tracked drive for all tests of the runner."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
-from lio_jax.commands.runtime import prepare_jax
 from lio_jax.run.track import CompiledStep, ScanResult, track
 from lio_jax.settings.settings import Settings, with_extrinsics, with_overrides
 from tests.run import inertial_drive, small_drive
-from tests.run.program_cache import kept_programs
-
-
-@pytest.fixture(scope="package", autouse=True)
-def program_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    with kept_programs(tmp_path_factory.getbasetemp() / "programs") as cache:
-        prepare_jax()
-        yield cache
 
 
 @pytest.fixture(scope="session")

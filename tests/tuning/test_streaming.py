@@ -1,4 +1,6 @@
-"""Streaming gradients against central differences, for every recipe and every differentiable leaf."""
+"""Streaming gradients against central differences; the recipes' own are in one file each."""
+
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -112,8 +114,21 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("recipe", "inertial"), [case for case in CASES if case not in NOT_SMOOTH])
-def test_gradients_of_every_leaf_agree_with_central_differences(recipe, inertial):
+BY_RECIPE = {
+    name: [inertial for recipe, inertial in CASES if recipe == name and (name, inertial) not in NOT_SMOOTH]
+    for name in RECIPES
+}
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_every_recipe_has_a_file_of_its_own(recipe):
+    """So that the worker processes share the long differences."""
+    assert BY_RECIPE[recipe]
+    assert Path(__file__).with_name(f"test_streaming_{recipe}.py").is_file()
+
+
+def check_gradients(recipe: str, inertial: bool) -> None:
+    """Gradients of every leaf agree with central differences."""
     chosen = settings(recipe, inertial, *TIGHT)
     recording = DoubleRecording(drive(), chosen)
     free = free_parameters(chosen.params(), DIFFERENTIABLE)
