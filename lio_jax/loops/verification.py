@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.leaf import numbers_of, traced
+from lio_jax.core.types import state_dtype
 from lio_jax.loops.alignment import aligned
 from lio_jax.loops.keyframe import Keyframe, level_points, padded, thinned
 from lio_jax.loops.overlap import LEAST_POINTS, Candidate, Comparison, conflict
