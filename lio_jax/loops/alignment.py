@@ -11,9 +11,10 @@ from jaxtyping import Array, Bool, Float, Float32
 from numpy.typing import NDArray
 
 from lio_jax.core.params import Params
+from lio_jax.core.status import CONVERGED
 from lio_jax.mapping.voxel_map import VoxelMap, empty_map, insert
 from lio_jax.pose_graph.graph import poses_from, rotation_matrices
-from lio_jax.registration.gauss_newton import CONVERGED, Registration
+from lio_jax.registration.gauss_newton import Registration
 from lio_jax.registration.voxel_plane_icp import register
 
 _CAPACITY = 65536

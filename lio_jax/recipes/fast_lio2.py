@@ -17,8 +17,9 @@ from jaxtyping import Array, Bool, Float, Int32
 from lio_jax.core.config import Config
 from lio_jax.core.error_state import NavEstimate
 from lio_jax.core.params import Params
+from lio_jax.core.status import ITERATION_LIMIT
 from lio_jax.core.types import ImuBatch, NavState, Scan
-from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
+from lio_jax.estimation.iterated_filter import Measurement
 from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.imu.path import deskew_along
 from lio_jax.lidar.thinning import mean_per_voxel

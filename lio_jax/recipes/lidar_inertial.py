@@ -14,8 +14,9 @@ from lio_jax.core.config import Config
 from lio_jax.core.error_state import NavEstimate
 from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.params import Params
+from lio_jax.core.status import ITERATION_LIMIT
 from lio_jax.core.types import ImuBatch, NavState, Scan
-from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
+from lio_jax.estimation.iterated_filter import Measurement
 from lio_jax.estimation.map_drift import MapDrift
 from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.imu.path import Path, deskew_along

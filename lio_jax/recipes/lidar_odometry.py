@@ -11,13 +11,13 @@ from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.config import Config
 from lio_jax.core.params import Params
+from lio_jax.core.status import LOST
 from lio_jax.core.types import NavState, Scan, initial_nav_state
 from lio_jax.lidar.deskew import deskew_constant_velocity
 from lio_jax.lidar.thinning import thinned
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
 from lio_jax.recipes import recipe
 from lio_jax.recipes.output import Output
-from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES
 from lio_jax.registration.voxel_plane_icp import Frame, register
 
 
@@ -99,7 +99,7 @@ def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[Stat
             params,
             config.registration.max_iterations,
         )
-        lost = (result.status == TOO_FEW_MATCHES) & ~first
+        lost = (result.status == LOST) & ~first
         twist = jnp.where(lost, state.twist, motion.twist_to(result.T_world_lidar))
         missed = jnp.linalg.norm((prediction.inverse() @ result.T_world_lidar).translation())
         error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)

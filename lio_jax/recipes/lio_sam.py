@@ -23,6 +23,7 @@ from lio_jax.core.error_state import DOF as NAV_DOF
 from lio_jax.core.errors import UsageError
 from lio_jax.core.geometry import from_blocks
 from lio_jax.core.params import Params
+from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, LOST
 from lio_jax.core.types import ImuBatch, NavState, Scan, state_dtype
 from lio_jax.estimation.chain import information_of, linearise
 from lio_jax.estimation.marginal_likelihood import log_evidence
@@ -49,7 +50,6 @@ from lio_jax.recipes.recipe import Needs, Recipe
 from lio_jax.recipes.smoothed_odometry import match_as_measurement, opened, runs_away
 from lio_jax.registration.feature_icp import register_features
 from lio_jax.registration.feature_map import empty_feature_map
-from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES
 from lio_jax.registration.lines_and_planes import FeaturePoints
 from lio_jax.registration.submap import ScanToSubmap, Submap, with_scan
 
@@ -176,7 +176,7 @@ class LioSam(Recipe[Config, Params, State]):
             )
             match = register_features(task, config.registration.max_iterations, 1)
             due = time - state.matched_at >= params.smoother.mapping_interval - _TIME_SLACK
-            lost = ((match.status == TOO_FEW_MATCHES) | ~enough) & ~first
+            lost = ((match.status == LOST) | ~enough) & ~first
             matched = due & ~lost & ~first
             T_matched = within_limits(match.T_world_lidar, params.smoother) @ state.nav.T_imu_lidar.inverse()
             attitude, _ = measured_attitude(imu, end + state.nav.time_offset, guess.rotation())

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.config import Config
 from lio_jax.core.params import Params
+from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, LOST
 from lio_jax.core.types import ImuBatch, NavState, Scan, initial_nav_state
 from lio_jax.lidar.deskew import deskew_constant_velocity
 from lio_jax.lidar.features import (
@@ -34,7 +35,7 @@ from lio_jax.recipes.recipe import Needs, Recipe
 from lio_jax.registration.cube_map import ScanToCubes, added_to
 from lio_jax.registration.feature_icp import register_features
 from lio_jax.registration.feature_map import FeatureMap, empty_feature_map, frames_at, placed_in
-from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES, Registration
+from lio_jax.registration.gauss_newton import Registration
 from lio_jax.registration.lines_and_planes import FeaturePoints
 from lio_jax.registration.scan_to_scan import LastScan, ScanToScan, empty_scan, last_scan
 
@@ -146,7 +147,7 @@ class Loam(Recipe[Config, Params, State]):
             guess = state.T_map_odom @ T_odom_lidar
             its_turn = state.scans % config.loam.mapping_every == 0
             mapping = _mapped(config, params, state.map.cubes, thin, guess, odometry, its_turn)
-            lost = (mapping.status == TOO_FEW_MATCHES) & ~first
+            lost = (mapping.status == LOST) & ~first
             T = mapping.T_world_lidar
         with jax.named_scope("insert"):
             # the map is a constant of the derivative

@@ -11,9 +11,7 @@ from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.geometry import rotation_matrix
 from lio_jax.core.params import RegistrationParams
-
-CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES = 0, 1, 2
-"""Status codes of a solve."""
+from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, LOST
 
 
 class Registration(eqx.Module):
@@ -30,7 +28,7 @@ class Registration(eqx.Module):
     """Robustly weighted root mean square distance to the map, m."""
     iterations: Int32[Array, ""]
     status: Int32[Array, ""]
-    """CONVERGED, ITERATION_LIMIT or TOO_FEW_MATCHES; in the last case the pose is the prediction."""
+    """CONVERGED, ITERATION_LIMIT or LOST; in the last case the pose is the prediction."""
 
 
 class NormalEquations(eqx.Module):
@@ -145,7 +143,5 @@ def registration_at(
         matches=equations.matches,
         rmse=equations.rmse(),
         iterations=iterations,
-        status=jnp.where(lost, TOO_FEW_MATCHES, jnp.where(done, CONVERGED, ITERATION_LIMIT)).astype(
-            jnp.int32
-        ),
+        status=jnp.where(lost, LOST, jnp.where(done, CONVERGED, ITERATION_LIMIT)).astype(jnp.int32),
     )

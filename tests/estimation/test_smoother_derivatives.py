@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.params import ImuParams
-from lio_jax.estimation.iterated_filter import CONVERGED
+from lio_jax.core.status import CONVERGED
 from lio_jax.estimation.marginal_likelihood import log_evidence
 from lio_jax.estimation.smoother import smooth
 from tests.experiments import bench_path  # noqa: F401
