@@ -18,12 +18,12 @@ from .evaluation.evaluate import evaluate as evaluate
 from .imu.path import deskew_along as deskew_along
 from .lidar.features import lio_sam_features as lio_sam_features
 from .lidar.features import loam_features as loam_features
+from .mapping.frame import Frame as Frame
 from .mapping.voxel_map import anchor_of as anchor_of
 from .recipes.inertial_filter import lidar_pose as lidar_pose
 from .recipes.inertial_filter import predicted as predicted
-from .registration.voxel_plane_icp import Frame as Frame
-from .registration.voxel_plane_icp import associate as associate
-from .registration.voxel_plane_icp import point_noise as point_noise
+from .registration.voxel_planes import associate as associate
+from .registration.voxel_planes import point_noise as point_noise
 from .run.run import RunResult as RunResult
 from .run.run import imu_feed as imu_feed
 from .run.run import run_sequence as run_sequence

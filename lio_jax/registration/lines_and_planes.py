@@ -15,10 +15,11 @@ from jaxtyping import Array, Bool, Float, Float32, Int32
 from lio_jax.core.geometry import across, eigenvalues_and_normal3
 from lio_jax.core.params import KnnParams
 from lio_jax.core.xla import computed_once
+from lio_jax.mapping.feature_map import FeaturePoints, Frames
+from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.point_map import PointMap
-from lio_jax.registration.gauss_newton import NormalEquations
 from lio_jax.registration.knn_planes import Planes, match_score, neighbours_within, no_planes, spread
-from lio_jax.registration.voxel_plane_icp import Frame
+from lio_jax.registration.scan_match import NormalEquations
 
 _Coordinates = Float32[Array, "n k"]
 """One coordinate of n points in each of k columns."""
@@ -29,22 +30,6 @@ class Lines(eqx.Module):
 
     first: Planes
     second: Planes
-
-
-class FeaturePoints(eqx.Module):
-    """Corners and surface points of a scan, m, lidar frame of one instant."""
-
-    corner: Float[Array, "c 3"]
-    corner_mask: Bool[Array, " c"]
-    surface: Float[Array, "s 3"]
-    surface_mask: Bool[Array, " s"]
-
-
-class Frames(eqx.Module):
-    """Of the lines and of the planes: they may come from maps with different grids."""
-
-    corner: Frame
-    surface: Frame
 
 
 class LinesAndPlanes(eqx.Module):

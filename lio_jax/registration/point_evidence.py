@@ -6,16 +6,10 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from lio_jax.core.params import Params
+from lio_jax.core.params import LidarParams, RegistrationParams
+from lio_jax.mapping.frame import Frame
 from lio_jax.registration.point_sums import point_sums
-from lio_jax.registration.voxel_plane_icp import (
-    Frame,
-    Matches,
-    PointNoise,
-    plane_noise,
-    point_noise,
-    point_variances,
-)
+from lio_jax.registration.voxel_planes import Matches, PointNoise, plane_noise, point_noise, point_variances
 
 
 class PointEvidence(eqx.Module):
@@ -34,7 +28,8 @@ def point_evidence(
     points: Float[Array, "k 3"],
     T_world_lidar: jaxlie.SE3,
     frame: Frame,
-    params: Params,
+    lidar: LidarParams,
+    registration: RegistrationParams,
 ) -> PointEvidence:
     """Return what the matched points tell at a pose, weighted as they were in the solve.
 
@@ -43,22 +38,23 @@ def point_evidence(
         points: m, lidar frame.
         T_world_lidar: the solution.
         frame: of the matches.
-        params: traced.
+        lidar: the noise of ranges and directions.
+        registration: the kernel, and how many points each counts as.
     """
     kind, dtype = points.dtype, T_world_lidar.wxyz_xyz.dtype
-    noise = point_noise(matches, points, T_world_lidar, frame, params)
+    noise = point_noise(matches, points, T_world_lidar, frame, lidar)
     # as in iteratively reweighted least squares, the weights are no part of the derivative
-    weight = jax.lax.stop_gradient(noise.weight(params.registration.kernel.astype(kind)))
+    weight = jax.lax.stop_gradient(noise.weight(registration.kernel.astype(kind)))
     sums = point_sums(
         jax.lax.stop_gradient(jnp.sum(_weighted(noise, weight), -1)),
         _rows,
         points,
         *frame.placing(T_world_lidar, kind),
-        jnp.stack(point_variances(params, kind)),
+        jnp.stack(point_variances(lidar, kind)),
         (matches, weight),
     ).astype(dtype)
     squared_error, log_det = sums
-    return PointEvidence(squared_error, log_det, params.registration.information_scale.astype(dtype))
+    return PointEvidence(squared_error, log_det, registration.information_scale.astype(dtype))
 
 
 def _rows(arm: Array, shift: Array, scales: Array, constants: tuple[Matches, Array]) -> Array:

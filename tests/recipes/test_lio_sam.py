@@ -21,10 +21,10 @@ from lio_jax.core.params import Params
 from lio_jax.core.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.core.types import ImuBatch
 from lio_jax.core.xla import PerShape
+from lio_jax.mapping.feature_map import empty_feature_map
 from lio_jax.recipes import recipe_named
 from lio_jax.recipes.lio_sam import LioSam
 from lio_jax.recipes.smoothed_odometry import match_as_measurement
-from lio_jax.registration.feature_map import empty_feature_map
 from lio_jax.run.scan_inputs import ImuFeed, padded
 from tests.recipes.test_fast_lio2 import ate, recording, truth
 

@@ -9,8 +9,8 @@ import pytest
 
 from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, LOST
 from lio_jax.mapping.voxel_map import empty_map
-from lio_jax.registration.gauss_newton import Registration
-from lio_jax.registration.voxel_plane_icp import register
+from lio_jax.registration.gauss_newton import Registration, gauss_newton
+from lio_jax.registration.voxel_planes import ScanToVoxels
 from tests.registration.scenes import (
     POLES_AND_WALLS,
     ROOM,
@@ -29,6 +29,20 @@ PARAMS = params_with(lidar__range_sigma=0.03)
 SCENES = {"room": ROOM, "poles and walls": POLES_AND_WALLS}
 MAPS = {name: map_of(sample(scene, 40000, NOISE, seed=0), PARAMS) for name, scene in SCENES.items()}
 TRUTH = pose([0.4, -0.3, 0.2], [0.03, -0.02, 0.25])
+
+
+def register(vmap, points_at, mask, prediction, error, params, max_iterations) -> Registration:
+    match = ScanToVoxels(
+        points_at=points_at,
+        T_predicted=prediction,
+        registration=params.registration,
+        map=vmap,
+        mask=mask,
+        prediction_error=error,
+        map_params=params.map,
+        lidar=params.lidar,
+    )
+    return gauss_newton(match, max_iterations)
 
 
 @partial(jax.jit, static_argnums=6)
