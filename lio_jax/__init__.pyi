@@ -18,6 +18,7 @@ from .imu.initialise_moving import initialise_moving as initialise_moving
 from .imu.path import deskew_along as deskew_along
 from .lidar.features import lio_sam_features as lio_sam_features
 from .lidar.features import loam_features as loam_features
+from .mapping.frame import Frame as Frame
 from .mapping.voxel_map import anchor_of as anchor_of
 from .recipes.inertial_filter import lidar_pose as lidar_pose
 from .recipes.inertial_filter import predicted as predicted
@@ -32,9 +33,8 @@ from .recipes.params import RecipeParams as RecipeParams
 from .recipes.recipe import Needs as Needs
 from .recipes.recipe import Recipe as Recipe
 from .recipes.recipe import State as State
-from .registration.voxel_plane_icp import Frame as Frame
-from .registration.voxel_plane_icp import associate as associate
-from .registration.voxel_plane_icp import point_noise as point_noise
+from .registration.voxel_planes import associate as associate
+from .registration.voxel_planes import point_noise as point_noise
 from .run.run import imu_feed as imu_feed
 from .run.run import run_sequence as run_sequence
 from .run.run import settings_for as settings_for

@@ -133,3 +133,15 @@ def from_blocks(
         margins = [(start, size - stop, 0) for (start, stop), size in zip(places, shape, strict=True)]
         padded.append(jax.lax.pad(block, jnp.zeros((), block.dtype), margins))
     return sum(padded[1:], padded[0])
+
+
+def adjoint(pose: jaxlie.SE3) -> Float[Array, "6 6"]:
+    """Return Ad with T exp(d) = exp(Ad d) T, where d holds the rotation (rad) before the translation (m).
+
+    jaxlie's own adjoint is for the other order.
+    """
+    turn, move = slice(0, 3), slice(3, 6)
+    matrix = rotation_matrix(pose.rotation())
+    return from_blocks(
+        (6, 6), (turn, turn, matrix), (move, move, matrix), (move, turn, skew(pose.translation()) @ matrix)
+    )

@@ -9,10 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.implicit import Problem, Solution, implicit
+from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, LOST, NOT_FINITE
 from lio_jax.estimation.innovation import Innovation, innovation_of, square_root_information
-
-CONVERGED, ITERATION_LIMIT, LOST, NOT_FINITE = 0, 1, 2, 3
-"""Status codes of an update; after LOST and NOT_FINITE the state and its covariance are the prior's."""
 
 State = TypeVar("State")
 """Any pytree."""
@@ -47,7 +45,7 @@ class Update(NamedTuple):
     """The last linearisation, at the iterate before ``state``."""
     iterations: Int32[Array, ""]
     status: Int32[Array, ""]
-    """CONVERGED, ITERATION_LIMIT, LOST or NOT_FINITE."""
+    """See :mod:`lio_jax.core.status`; after LOST and NOT_FINITE state and covariance are the prior's."""
 
 
 def iterated_update(

@@ -18,7 +18,7 @@ import jaxlie
 from jaxtyping import Array, Float, Int32
 
 from lio_jax.core.error_state import DOF, POSITION, ROTATION, VELOCITY
-from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
+from lio_jax.core.geometry import adjoint, from_blocks, rotation_matrix, skew
 from lio_jax.core.types import NavState
 
 _POSE = slice(ROTATION.start, POSITION.stop)
@@ -37,21 +37,9 @@ class MapDrift(eqx.Module):
         return MapDrift(jnp.zeros((6, 6), dtype))
 
     def carried(self, T_world_before: jaxlie.SE3, T_world_imu: jaxlie.SE3) -> "MapDrift":
-        """Return the drift with the covariance at another pose in the same map.
-
-        Args:
-            T_world_before: the pose to which the drift refers now.
-            T_world_imu: the pose to which the result refers.
-        """
-        between = T_world_imu.inverse() @ T_world_before
-        R = rotation_matrix(between.rotation())
-        adjoint = from_blocks(
-            (6, 6),
-            (ROTATION, ROTATION, R),
-            (POSITION, POSITION, R),
-            (POSITION, ROTATION, skew(between.translation()) @ R),
-        )
-        covariance = adjoint @ self.covariance @ adjoint.T
+        """Return the drift as seen from another pose in the same map."""
+        carry = adjoint(T_world_imu.inverse() @ T_world_before)
+        covariance = carry @ self.covariance @ carry.T
         return MapDrift((covariance + covariance.T) / 2)
 
     def grown(

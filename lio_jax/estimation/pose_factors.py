@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.geometry import rotation_matrix, skew
+from lio_jax.core.geometry import adjoint, rotation_matrix, skew
 from lio_jax.estimation.motion_state import POSE_DOF, MotionState
-from lio_jax.estimation.pose_logarithm import adjoint, log_and_jacobian
+from lio_jax.estimation.pose_logarithm import log_and_jacobian
 from lio_jax.estimation.quadratic import Quadratic, robust_quadratic
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from lio_jax.core.geometry import rotation_matrix, skew
+from lio_jax.core.geometry import skew
 from lio_jax.imu.rotation_integrals import rotation_coefficients
 
 
@@ -51,12 +51,6 @@ def log_and_jacobian(pose: jaxlie.SE3) -> tuple[Float[Array, "*b 6"], Float[Arra
         axis=-2,
     )
     return jnp.concatenate([turn, (left_inverse @ column)[..., 0]], axis=-1), jacobian
-
-
-def adjoint(pose: jaxlie.SE3) -> Float[Array, "6 6"]:
-    """Return the adjoint Ad for which T exp(d) = exp(Ad d) T."""
-    matrix = rotation_matrix(pose.rotation())
-    return jnp.block([[matrix, jnp.zeros_like(matrix)], [skew(pose.translation()) @ matrix, matrix]])
 
 
 def _coefficients(rotvec: Float[Array, "*b 3"]) -> list[Float[Array, "*b 1 1"]]:

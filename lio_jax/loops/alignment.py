@@ -13,11 +13,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32
 from numpy.typing import NDArray
 
+from lio_jax.core.status import CONVERGED
+from lio_jax.loops.params import AlignmentParams
 from lio_jax.mapping.voxel_map import VoxelMap, empty_map, insert
 from lio_jax.pose_graph.graph import poses_from, rotation_matrices
-from lio_jax.registration.gauss_newton import CONVERGED, Registration
-from lio_jax.registration.params import Params
-from lio_jax.registration.voxel_plane_icp import register
+from lio_jax.registration.gauss_newton import Registration, gauss_newton
+from lio_jax.registration.scan_match import FixedPoints
+from lio_jax.registration.voxel_planes import ScanToVoxels
 
 _CAPACITY = 65536
 """Number of voxels of the target's map."""
@@ -52,7 +54,7 @@ def aligned(
     source_mask: NDArray[np.bool_],
     guesses: NDArray[np.float64],
     most: int,
-    params: Params,
+    params: AlignmentParams,
 ) -> Alignments:
     """Return the alignment from each of n guesses.
 
@@ -78,15 +80,6 @@ def aligned(
     return Alignments(found, information[:count], degenerate[:count].any(axis=1), status[:count] == CONVERGED)
 
 
-class _Still(eqx.Module):
-    """Points without motion compensation."""
-
-    points: Float32[Array, "k 3"]
-
-    def __call__(self, T_world_lidar: jaxlie.SE3) -> Float32[Array, "k 3"]:
-        return self.points
-
-
 @jax.jit
 def _aligned(
     target: Float32[Array, "m 3"],
@@ -95,10 +88,10 @@ def _aligned(
     source_mask: Bool[Array, " k"],
     starts: jaxlie.SE3,
     count: Array,
-    params: Params,
+    params: AlignmentParams,
 ) -> Registration:
     def stage(starts: jaxlie.SE3, voxel_size: Float[Array, ""], error: float) -> Registration:
-        sized = eqx.tree_at(lambda params: params.map.voxel_size, params, voxel_size)
+        sized = eqx.tree_at(lambda map_params: map_params.voxel_size, params.map, voxel_size)
         vmap = _map_of(target, target_mask, voxel_size)
         dtype = starts.wxyz_xyz.dtype
 
@@ -106,9 +99,17 @@ def _aligned(
             number, start = case
             # padded guesses have no points, so they cost nothing
             mask = source_mask & (number < count)
-            return register(
-                vmap, _Still(source), mask, jaxlie.SE3(start), jnp.asarray(error, dtype), sized, _ITERATIONS
+            match = ScanToVoxels(
+                points_at=FixedPoints(source),
+                T_predicted=jaxlie.SE3(start),
+                registration=params.registration,
+                map=vmap,
+                mask=mask,
+                prediction_error=jnp.asarray(error, dtype),
+                map_params=sized,
+                lidar=params.lidar,
             )
+            return gauss_newton(match, _ITERATIONS)
 
         # one after the other: each stops where it has converged
         return jax.lax.map(one, (jnp.arange(len(starts.wxyz_xyz)), starts.wxyz_xyz))

@@ -10,7 +10,7 @@ from lio_jax.imu.params import ImuConfig
 from lio_jax.lidar.params import BeamParams, ScanConfig
 from lio_jax.mapping.params import VoxelMapParams
 from lio_jax.recipes.params import InertialConfig, InertialParams, MotionParams
-from lio_jax.registration.params import FilterMatch, GaussNewtonMatch, RobustMatch, ThinnedMatch
+from lio_jax.registration.params import GaussNewtonMatch, RobustFilterMatch, ThinnedMatch
 
 
 class InertialThinning(eqx.Module):
@@ -21,7 +21,7 @@ class InertialThinning(eqx.Module):
     matched: the prediction needs fewer points to correct it."""
 
 
-class VoxelMatch(GaussNewtonMatch, FilterMatch, ThinnedMatch, InertialThinning, RobustMatch):
+class VoxelMatch(GaussNewtonMatch, RobustFilterMatch, ThinnedMatch, InertialThinning):
     """A match with the planes of a voxel map, by Gauss-Newton or in the filter."""
 
 

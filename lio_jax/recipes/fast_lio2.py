@@ -17,16 +17,14 @@ from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.error_state import NavEstimate
 from lio_jax.core.leaf import section, static
+from lio_jax.core.status import ITERATION_LIMIT
 from lio_jax.core.types import ImuBatch, NavState, Scan
-from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
-from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.imu.params import ImuParams, InitialParams
 from lio_jax.imu.path import deskew_along
 from lio_jax.lidar.params import LidarParams, ScanConfig
 from lio_jax.lidar.thinning import mean_per_voxel
 from lio_jax.mapping.params import MapConfig, MapParams, MovingCubeParams
 from lio_jax.mapping.point_map import EDGE, PointMap, empty_map, insert, move_cube
-from lio_jax.mapping.voxel_map import anchor_of
 from lio_jax.recipes import recipe
 from lio_jax.recipes.constant_velocity import (
     carried_on,
@@ -35,20 +33,12 @@ from lio_jax.recipes.constant_velocity import (
     unlevelled_start,
     until_its_middle,
 )
-from lio_jax.recipes.inertial_filter import (
-    Linearised,
-    corrected,
-    evidence_of,
-    levelled_start,
-    lidar_pose,
-    predicted,
-    registration_of,
-)
+from lio_jax.recipes.inertial_filter import levelled_start, lidar_pose, predicted
 from lio_jax.recipes.output import Output
 from lio_jax.recipes.params import InertialConfig, InertialParams
 from lio_jax.recipes.recipe import Needs, Recipe
-from lio_jax.registration.association import Association, associated, no_association
-from lio_jax.registration.knn_planes import Planes, associate, linearise, no_planes
+from lio_jax.recipes.scan_update import corrected, evidence_of, registration_of
+from lio_jax.registration.knn_planes import ScanToPoints
 from lio_jax.registration.params import (
     FilterMatch,
     KnnConfig,
@@ -56,7 +46,7 @@ from lio_jax.registration.params import (
     ScoredFitParams,
     ThinnedMatch,
 )
-from lio_jax.registration.voxel_plane_icp import Frame
+from lio_jax.registration.scan_match import FixedPoints
 
 _GYR_COV, _ACC_COV, _B_GYR_COV, _B_ACC_COV = 0.1, 0.1, 1e-4, 1e-4
 IMU_RATE = 200.0
@@ -222,9 +212,19 @@ class FastLio2(Recipe[Config, Params, State]):
             spacing = params.registration.point_spacing.astype(jnp.float32)
             thin = mean_per_voxel(points, in_range, spacing, config.lidar.registration_points)
         with jax.named_scope("update"):
-            frame = Frame(*anchor_of(T_predicted.translation(), EDGE * params.map.voxel_size))
-            scan_match = _ScanMatch(state.map, thin.points, thin.mask, frame, params, config.knn.neighbours)
-            update, _ = corrected(config, params, prior, scan_match, scan_match.before(prior.nav))
+            match = ScanToPoints(
+                points_at=FixedPoints(thin.points),
+                T_predicted=T_predicted,
+                registration=params.registration,
+                map=state.map,
+                mask=thin.mask,
+                map_params=params.map,
+                knn=params.knn,
+                lidar=params.lidar,
+                neighbours=config.knn.neighbours,
+            )
+            frame = match.frame()
+            update, _ = corrected(prior, match, config.registration.max_iterations)
             posterior: NavEstimate = update.state
             lost = (update.status > ITERATION_LIMIT) & ~first
             T_world_lidar = lidar_pose(posterior.nav)
@@ -257,7 +257,7 @@ class FastLio2(Recipe[Config, Params, State]):
             map=cube_map,
         )
         return new_state, Output(
-            registration=registration_of(update, update.measurement.aux.linearised, T_world_lidar),
+            registration=registration_of(update, T_world_lidar),
             lost=lost,
             nis=update.innovation.nis,
             nis_dof=update.innovation.dof,
@@ -281,56 +281,3 @@ def _filtered(
     near, far = params.lidar.min_range.astype(jnp.float32), params.lidar.max_range.astype(jnp.float32)
     mask = scan.mask[::every] & (squared_range > near**2) & (squared_range < far**2)
     return jnp.where(mask[:, None], points, 0.0), time, mask
-
-
-class _Trial(eqx.Module):
-    """What one linearisation leaves to the next."""
-
-    association: Association[Planes]
-    linearised: Linearised
-
-
-class _ScanMatch(eqx.Module):
-    """The scan against the map, as a measurement of the navigation state."""
-
-    map: PointMap
-    points: Float[Array, "k 3"]
-    mask: Bool[Array, " k"]
-    frame: Frame
-    params: Params
-    neighbours: int = eqx.field(static=True)
-
-    def before(self, nav: NavState) -> _Trial:
-        """Return what the first linearisation starts from."""
-        nothing = Linearised.nothing(nav.velocity.dtype)
-        return _Trial(no_association(no_planes(self.mask), lidar_pose(nav)), nothing)
-
-    def measure(self, nav: NavState, last: _Trial) -> Measurement:
-        """Find each point's plane, anew where the last step was large, and linearise at ``nav``."""
-        T = lidar_pose(nav)
-        association = associated(
-            last.association,
-            lambda: associate(self.map, self.points, self.mask, T, self.frame, self.params, self.neighbours),
-            self.points,
-            self.mask,
-            T,
-            self.params.registration.reassociation_distance,
-        )
-        return self._linearised(nav, association)
-
-    def again(self, nav: NavState, last: _Trial) -> Measurement:
-        """Linearise at ``nav`` with the planes of the last linearisation."""
-        return self._linearised(nav, last.association)
-
-    def _linearised(self, nav: NavState, association: Association[Planes]) -> Measurement:
-        settings = self.params.registration
-        equations = linearise(association.found, self.points, lidar_pose(nav), self.frame, self.params)
-        information, gradient, degenerate = keep_observed(
-            equations.hessian, equations.gradient, equations.arm_squared, settings.inertial_degeneracy_ratio
-        )
-        return Measurement(
-            information=settings.information_scale * information,
-            gradient=settings.information_scale * gradient,
-            lost=equations.matches < settings.min_matches,
-            aux=_Trial(association, Linearised(equations, degenerate)),
-        )

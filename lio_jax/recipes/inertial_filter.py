@@ -1,8 +1,5 @@
-"""What the recipes with an error-state filter share: the start, the prediction and the form of the result."""
+"""What the recipes with an error-state filter share: the start and the prediction."""
 
-from typing import Any, Protocol, runtime_checkable
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -22,15 +19,10 @@ from lio_jax.core.error_state import (
 )
 from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
 from lio_jax.core.types import ImuBatch, NavState, Scan
-from lio_jax.estimation.iterated_filter import Measurement, Update
-from lio_jax.estimation.nav_update import predicted_pose_covariance, update_nav
 from lio_jax.imu.initialise import initialise_at_rest
 from lio_jax.imu.path import Path
 from lio_jax.imu.strapdown import propagate_sweep
-from lio_jax.recipes.output import Evidence
-from lio_jax.recipes.params import InertialParams, RecipeConfig
-from lio_jax.registration.gauss_newton import NormalEquations, Registration
-from lio_jax.registration.point_evidence import PointEvidence
+from lio_jax.recipes.params import InertialParams
 
 
 def levelled_start(params: InertialParams, imu: ImuBatch) -> NavEstimate:
@@ -116,81 +108,6 @@ def _held_at_mean(state: NavEstimate, sweep: Float[Array, ""]) -> NavEstimate:
     return NavEstimate(state.nav, (covariance + covariance.T) / 2)
 
 
-@runtime_checkable
-class ScanMatch(Protocol):
-    """A scan against a map, as a measurement of the lidar's pose; a pytree."""
-
-    def measure(self, nav: NavState, last: Any) -> Measurement:
-        """Match and linearise at a state, given what the last linearisation left."""
-        ...
-
-    def again(self, nav: NavState, last: Any) -> Measurement:
-        """Linearise at a state with the choices of the last linearisation."""
-        ...
-
-
-def corrected(
-    config: RecipeConfig, params: InertialParams, prior: SweptState, scan_match: ScanMatch, before: Any
-) -> tuple[Update, NavState]:
-    """Return the update by a scan match, and the state with the pose at which the scan lies on the map.
-
-    Args:
-        config: static.
-        params: traced.
-        prior: predicted state.
-        scan_match: the measurement.
-        before: what its first linearisation starts from.
-    """
-    return update_nav(
-        prior,
-        scan_match.measure,
-        max_iterations=config.registration.max_iterations,
-        rotation_tolerance=params.registration.rotation_tolerance,
-        translation_tolerance=params.registration.translation_tolerance,
-        first_aux=before,
-        again=scan_match.again,
-    )
-
-
 def lidar_pose(nav: NavState) -> jaxlie.SE3:
     """Return T_world_lidar."""
     return jaxlie.SE3((nav.T_world_imu @ nav.T_imu_lidar).wxyz_xyz)
-
-
-class Linearised(eqx.Module):
-    """The last linearisation of a scan match."""
-
-    equations: NormalEquations
-    degenerate: Bool[Array, " 6"]
-
-    @staticmethod
-    def nothing(dtype: jnp.dtype) -> "Linearised":
-        """Return a linearisation without matches."""
-        return Linearised(NormalEquations.nothing(dtype), jnp.zeros(6, jnp.bool_))
-
-
-def registration_of(update: Update, last: Linearised, T_world_lidar: jaxlie.SE3) -> Registration:
-    """Return the update in the terms of a scan-to-map solve."""
-    equations = last.equations
-    to_body = jax.scipy.linalg.block_diag(*[rotation_matrix(T_world_lidar.rotation())] * 2)
-    return Registration(
-        T_world_lidar=T_world_lidar,
-        information=to_body.T @ update.measurement.information @ to_body,
-        degenerate=last.degenerate,
-        matches=equations.matches,
-        rmse=equations.rmse(),
-        iterations=update.iterations,
-        status=update.status,
-    )
-
-
-def evidence_of(update: Update, prior: SweptState, points: PointEvidence | None = None) -> Evidence:
-    """Return how well a scan was foretold."""
-    measured = update.measurement
-    return Evidence(
-        innovation=update.innovation,
-        information=measured.information,
-        gradient=measured.gradient,
-        pose_covariance=predicted_pose_covariance(prior),
-        points=points,
-    )

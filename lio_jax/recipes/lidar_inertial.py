@@ -8,32 +8,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float, Int32
+from jaxtyping import Array, Float, Int32
 
 from lio_jax.core.error_state import NavEstimate
 from lio_jax.core.implicit import with_derivative_of
+from lio_jax.core.status import ITERATION_LIMIT
 from lio_jax.core.types import ImuBatch, NavState, Scan
-from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, Measurement
 from lio_jax.estimation.map_drift import MapDrift
-from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.imu.path import Path, deskew_along
 from lio_jax.lidar.thinning import ThinnedScan, thinned
-from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
+from lio_jax.mapping.voxel_map import VoxelMap, empty_map, insert
 from lio_jax.recipes import recipe
 from lio_jax.recipes.default_params import Config, Params
-from lio_jax.recipes.inertial_filter import (
-    Linearised,
-    corrected,
-    evidence_of,
-    levelled_start,
-    lidar_pose,
-    predicted,
-    registration_of,
-)
+from lio_jax.recipes.inertial_filter import levelled_start, lidar_pose, predicted
 from lio_jax.recipes.output import Output
-from lio_jax.registration.association import Association, associated, no_association
+from lio_jax.recipes.scan_update import corrected, evidence_of, registration_of
 from lio_jax.registration.point_evidence import point_evidence
-from lio_jax.registration.voxel_plane_icp import Frame, Matches, associate, linearise, no_matches
+from lio_jax.registration.scan_match import FixedPoints
+from lio_jax.registration.voxel_planes import ScanToVoxels
 
 
 class State(recipe.State):
@@ -100,14 +92,22 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
         points = deskew_along(*still, thin.points, thin.time)
         to_match = _to_match(path, prior.nav.T_imu_lidar, thin, points)
     with jax.named_scope("update"):
-        frame = Frame(*anchor_of(T_predicted.translation(), params.map.voxel_size))
-        scan_match = _ScanMatch(state.map, to_match, thin.matched.mask, frame, state.prediction_error, params)
-        update, matched = corrected(config, params, prior, scan_match, scan_match.before(T_predicted))
+        match = ScanToVoxels(
+            points_at=FixedPoints(to_match),
+            T_predicted=T_predicted,
+            registration=params.registration,
+            map=state.map,
+            mask=thin.matched.mask,
+            prediction_error=state.prediction_error,
+            map_params=params.map,
+            lidar=params.lidar,
+        )
+        update, matched = corrected(prior, match, config.registration.max_iterations)
         posterior: NavEstimate = update.state
         lost = (update.status > ITERATION_LIMIT) & ~first
         T_world_lidar, T_matched = lidar_pose(posterior.nav), lidar_pose(matched)
-        matches = update.measurement.aux.association.found
-        evidence = point_evidence(matches, to_match, T_matched, frame, params)
+        frame, matches = match.frame(), update.measurement.aux.association.found
+        evidence = point_evidence(matches, to_match, T_matched, frame, params.lidar, params.registration)
         missed = jnp.linalg.norm((T_predicted.inverse() @ T_matched).translation())
         error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
     with jax.named_scope("insert"):
@@ -135,7 +135,7 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
         map=vmap,
     )
     return new_state, Output(
-        registration=registration_of(update, update.measurement.aux.linearised, T_world_lidar),
+        registration=registration_of(update, T_world_lidar),
         lost=lost,
         nis=update.innovation.nis,
         nis_dof=update.innovation.dof,
@@ -150,14 +150,6 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
     )
 
 
-class _Trial(eqx.Module):
-    """What one linearisation leaves to the next."""
-
-    association: Association[Matches]
-    iteration: Int32[Array, ""]
-    linearised: Linearised
-
-
 def _to_match(
     path: Path, T_imu_lidar: jaxlie.SE3, thin: ThinnedScan, deskewed: Float[Array, "m 3"]
 ) -> Float[Array, "k 3"]:
@@ -166,60 +158,3 @@ def _to_match(
     return with_derivative_of(
         deskewed[index], deskew_along, path, T_imu_lidar, thin.points[index], thin.time[index]
     )
-
-
-class _ScanMatch(eqx.Module):
-    """The scan against the map, as a measurement of the navigation state."""
-
-    map: VoxelMap
-    points: Float[Array, "k 3"]
-    mask: Bool[Array, " k"]
-    frame: Frame
-    prediction_error: Float[Array, ""]
-    params: Params
-
-    def before(self, T_world_lidar: jaxlie.SE3) -> _Trial:
-        """Return what the first linearisation starts from."""
-        nothing = Linearised.nothing(T_world_lidar.wxyz_xyz.dtype)
-        return _Trial(no_association(no_matches(self.mask), T_world_lidar), jnp.int32(0), nothing)
-
-    def measure(self, nav: NavState, last: _Trial) -> Measurement:
-        """Match and linearise at ``nav``; the kernel opens and narrows as in :func:`register`."""
-        T = lidar_pose(nav)
-        association = associated(
-            last.association,
-            lambda: associate(self.map, self.points, self.mask, T, self.frame, self.params),
-            self.points,
-            self.mask,
-            T,
-            self.params.registration.reassociation_distance,
-        )
-        return self._linearised(nav, association, last.iteration)
-
-    def again(self, nav: NavState, last: _Trial) -> Measurement:
-        """Linearise at ``nav`` with the matches and the kernel of the last linearisation."""
-        return self._linearised(nav, last.association, last.iteration - 1)
-
-    def _linearised(
-        self, nav: NavState, association: Association[Matches], iteration: Int32[Array, ""]
-    ) -> Measurement:
-        settings = self.params.registration
-        opening = self.prediction_error * 0.5 ** iteration.astype(self.prediction_error.dtype)
-        equations = linearise(
-            association.found,
-            self.points,
-            lidar_pose(nav),
-            self.frame,
-            settings.kernel + opening,
-            self.params,
-        )
-        information, gradient, degenerate = keep_observed(
-            equations.hessian, equations.gradient, equations.arm_squared, settings.inertial_degeneracy_ratio
-        )
-        return Measurement(
-            information=settings.information_scale * information,
-            gradient=settings.information_scale * gradient,
-            lost=equations.matches < settings.min_matches,
-            aux=_Trial(association, iteration + 1, Linearised(equations, degenerate)),
-            settled=opening < settings.kernel,
-        )

@@ -7,17 +7,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float, Int32
+from jaxtyping import Array, Float, Int32
 
+from lio_jax.core.status import LOST
 from lio_jax.core.types import NavState, Scan, initial_nav_state
 from lio_jax.lidar.deskew import deskew_constant_velocity
 from lio_jax.lidar.thinning import thinned
+from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
 from lio_jax.recipes import recipe
 from lio_jax.recipes.default_params import Config, Params
 from lio_jax.recipes.output import Output
-from lio_jax.registration.gauss_newton import TOO_FEW_MATCHES
-from lio_jax.registration.voxel_plane_icp import Frame, register
+from lio_jax.recipes.trial_motion import TrialMotion
+from lio_jax.registration.gauss_newton import gauss_newton
+from lio_jax.registration.voxel_planes import ScanToVoxels
 
 
 class State(recipe.State):
@@ -77,29 +80,26 @@ def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[Stat
     with jax.named_scope("thin"):
         spacing = params.registration.point_spacing
         thin = thinned(params, scan, spacing, config.lidar.insertion_points, config.lidar.registration_points)
-        delay = thin.time - 0.5 * scan.duration
-        matched = thin.matched
     with jax.named_scope("predict"):
-        middle = 0.5 * scan.duration.astype(state.twist.dtype)
-        first = state.scans == 0
-        # the first scan's end is the world's origin, however many empty scans went before
-        interval = jnp.where(first, 0.0, scan.interval.astype(state.twist.dtype))
-        elapsed = state.mid_to_end + interval - middle
-        prediction = state.T_world_lidar @ jaxlie.SE3.exp(elapsed * state.twist)
-        motion = _Motion(state.T_world_lidar, state.twist, elapsed, ~first & (elapsed > 0))
+        first, T_last = state.scans == 0, state.T_world_lidar
+        motion = TrialMotion.since(state.twist, state.mid_to_end, scan, first)
+        prediction = T_last @ motion.predicted()
 
     with jax.named_scope("register"):
-        result = register(
-            state.map,
-            _Deskewed(thin.points[matched.index], delay[matched.index], motion),
-            matched.mask,
-            prediction,
-            state.prediction_error,
-            params,
-            config.registration.max_iterations,
+        index = thin.matched.index
+        match = ScanToVoxels(
+            points_at=_Deskewed(thin.points[index], thin.time[index], motion, T_last),
+            T_predicted=prediction,
+            registration=params.registration,
+            map=state.map,
+            mask=thin.matched.mask,
+            prediction_error=state.prediction_error,
+            map_params=params.map,
+            lidar=params.lidar,
         )
-        lost = (result.status == TOO_FEW_MATCHES) & ~first
-        twist = jnp.where(lost, state.twist, motion.twist_to(result.T_world_lidar))
+        result = gauss_newton(match, config.registration.max_iterations)
+        lost = (result.status == LOST) & ~first
+        twist = jnp.where(lost, state.twist, motion.twist_to(T_last.inverse() @ result.T_world_lidar))
         missed = jnp.linalg.norm((prediction.inverse() @ result.T_world_lidar).translation())
         error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
         # it only opens the kernel, which is closed at the solution
@@ -107,7 +107,7 @@ def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[Stat
     with jax.named_scope("insert"):
         T = result.T_world_lidar
         anchor, corner = anchor_of(T.translation(), params.map.voxel_size)
-        deskewed = deskew_constant_velocity(thin.points, delay, twist)
+        deskewed = deskew_constant_velocity(thin.points, thin.time - 0.5 * scan.duration, twist)
         _, anchored = jax.lax.stop_gradient(Frame(anchor, corner).place(deskewed, T))
         vmap, added = insert(
             state.map,
@@ -118,7 +118,7 @@ def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[Stat
             params.map.reach.astype(jnp.float32),
         )
 
-    T_world_imu = T @ jaxlie.SE3.exp(middle * twist) @ params.extrinsics.T_imu_lidar().inverse()
+    T_world_imu = T @ jaxlie.SE3.exp(motion.middle * twist) @ params.extrinsics.T_imu_lidar().inverse()
     nav = eqx.tree_at(
         lambda nav: (nav.T_world_imu, nav.velocity),
         state.nav,
@@ -128,7 +128,7 @@ def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[Stat
     new_state = State(
         nav=nav,
         T_world_lidar=T,
-        mid_to_end=middle,
+        mid_to_end=motion.middle,
         twist=twist,
         prediction_error=error,
         scans=state.scans + seen.astype(jnp.int32),
@@ -148,30 +148,18 @@ def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[Stat
     )
 
 
-class _Motion(eqx.Module):
-    """The motion since the last scan, as long as its end is under trial."""
-
-    T_last: jaxlie.SE3
-    last_twist: Float[Array, "6"]
-    elapsed: Float[Array, ""]
-    known: Bool[Array, ""]
-
-    def twist_to(self, T_world_lidar: jaxlie.SE3) -> Float[Array, "6"]:
-        """Return the constant twist that leads to a pose; the last one where there was no scan before."""
-        moved = (self.T_last.inverse() @ T_world_lidar).log()
-        return jnp.where(self.known, moved / jnp.where(self.known, self.elapsed, 1.0), self.last_twist)
-
-
 class _Deskewed(eqx.Module):
     """The points to match, compensated by the motion that a trial pose implies."""
 
     points: Float[Array, "k 3"]
-    delay: Float[Array, " k"]
-    motion: _Motion
+    time: Float[Array, " k"]
+    motion: TrialMotion
+    T_last: jaxlie.SE3
+    """The pose at which the motion begins."""
 
     def __call__(self, T_world_lidar: jaxlie.SE3) -> Float[Array, "k 3"]:
         """Return the points in the lidar frame of the scan's middle."""
-        return deskew_constant_velocity(self.points, self.delay, self.motion.twist_to(T_world_lidar))
+        return self.motion.compensated(self.points, self.time, self.T_last.inverse() @ T_world_lidar)
 
 
 def _imu_velocity(T_world_imu: jaxlie.SE3, twist: Float[Array, "6"], params: Params) -> Float[Array, "3"]:

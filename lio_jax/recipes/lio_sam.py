@@ -13,74 +13,48 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float, Int32
+from jaxtyping import Array, Float
 
 from lio_jax.core.error_state import DOF as NAV_DOF
 from lio_jax.core.errors import UsageError
 from lio_jax.core.geometry import from_blocks
+from lio_jax.core.status import CONVERGED, ITERATION_LIMIT
 from lio_jax.core.types import ImuBatch, NavState, Scan, state_dtype
-from lio_jax.estimation.chain import information_of, linearise
 from lio_jax.estimation.marginal_likelihood import log_evidence
 from lio_jax.estimation.motion_state import DOF
-from lio_jax.estimation.sliding_window import Added, Window, append_and_update
+from lio_jax.estimation.sliding_window import Window
 from lio_jax.estimation.smoother import Smoothed
-from lio_jax.imu.path import Path, deskew_along
-from lio_jax.imu.preintegration import preintegrate_parallel
-from lio_jax.imu.sampling import sample_intervals
-from lio_jax.imu.strapdown import path_along
 from lio_jax.lidar.features import (
-    FeatureCloud,
     check_sizes,
-    in_single_precision,
-    lio_sam_features,
-    thinned_features,
 )
-from lio_jax.mapping.keyframes import is_due, no_keyframes
-from lio_jax.recipes import recipe
+from lio_jax.mapping.feature_map import empty_feature_map
+from lio_jax.mapping.keyframes import no_keyframes
+from lio_jax.mapping.submap import Submap
 from lio_jax.recipes.inertial_filter import levelled_start, lidar_pose
 from lio_jax.recipes.lio_sam_params import Config, Params
+from lio_jax.recipes.lio_sam_stages import (
+    Addition,
+    Clock,
+    Features,
+    MapMatch,
+    Smoothing,
+    State,
+    as_nav,
+    clock_at,
+    compensated,
+    keyframe,
+    picked_features,
+    predict,
+    scan_to_map,
+    smooth,
+)
 from lio_jax.recipes.output import Output
-from lio_jax.recipes.pose_limits import drawn_to_tilt, measured_attitude, within_limits
+from lio_jax.recipes.pose_limits import measured_attitude
 from lio_jax.recipes.recipe import Needs, Recipe
-from lio_jax.recipes.smoothed_odometry import match_as_measurement, opened, runs_away
-from lio_jax.registration.feature_icp import register_features
-from lio_jax.registration.feature_map import empty_feature_map
-from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES
-from lio_jax.registration.lines_and_planes import FeaturePoints
-from lio_jax.registration.submap import ScanToSubmap, Submap, with_scan
-
-
-class State(recipe.State):
-    """What is carried from scan to scan."""
-
-    nav: NavState
-    """State at the last scan's end: the matched pose, and the smoother's velocity and biases."""
-    window: Window
-    """The smoother's states, the latest at the last scan's end."""
-    time: Float[Array, ""]
-    """Time of the last scan's end since the first scan's end, s."""
-    matched_at: Float[Array, ""]
-    """Time of the end of the last matched scan since the first scan's end, s."""
-    scans: Int32[Array, ""]
-    """Number of scans with points so far."""
-    map: Submap
-
-    def with_velocity_of(self, found: "State") -> "State":
-        """Return this first state with the velocity of a later one."""
-        rows = self.window.states.velocity
-        velocity = found.nav.velocity
-
-        def places(state: Any) -> tuple[Any, ...]:
-            window = state.window
-            return state.nav.velocity, window.states.velocity, window.chain.prior.origin.velocity
-
-        return eqx.tree_at(
-            places, self, (velocity, jnp.broadcast_to(velocity[..., None, :], rows.shape), velocity)
-        )
+from lio_jax.recipes.smoothed_odometry import opened
 
 
 class LioSam(Recipe[Config, Params, State]):
@@ -150,162 +124,58 @@ class LioSam(Recipe[Config, Params, State]):
         """
         config = self.config
         assert imu is not None
-        first = state.scans == 0
-        dtype = state.nav.velocity.dtype
-        end = scan.duration.astype(dtype)
-        interval = jnp.where(first, 0.0, scan.interval.astype(dtype))
-        time = state.time + interval
+        clock = clock_at(state, scan)
         with jax.named_scope("features"):
-            features = in_single_precision(lio_sam_features, config, params, scan)
-            room = config.lio_sam.corner_points, config.lio_sam.surface_points
-            corner, surface, thinned_away = thinned_features(features.corner, features.surface, params, *room)
-            least = params.submap.min_corners, params.submap.min_surfaces
-            enough = (jnp.sum(corner.mask) >= least[0]) & (jnp.sum(surface.mask) >= least[1])
-            # a first scan that is too poor would be a map in which nothing is ever found
-            seen = jnp.where(first, enough, jnp.any(features.surface.mask))
+            features = picked_features(config, params, scan, clock.first)
         with jax.named_scope("predict"):
-            odometry = _as_nav(state.nav, state.window)
-            # the first scan's end is the world's origin: its samples only deskew it
-            path = path_along(odometry, imu, jnp.where(first, 0.0, end - interval), end)
-            predicted = jaxlie.SE3(path.T_world_imu.wxyz_xyz[-1])
-            moved = odometry.T_world_imu.inverse() @ predicted
-            guess = jaxlie.SE3(
-                jnp.where(first, state.nav.T_world_imu.wxyz_xyz, (state.nav.T_world_imu @ moved).wxyz_xyz)
-            )
-            points = _compensated(corner, surface, path, state.nav.T_imu_lidar)
+            prediction = predict(state, clock, imu)
+            points = compensated(features, prediction.path, state.nav.T_imu_lidar)
         with jax.named_scope("scan_to_map"):
-            task = ScanToSubmap(
-                map=state.map.features,
-                points=points,
-                T_predicted=jaxlie.SE3((guess @ state.nav.T_imu_lidar).wxyz_xyz),
-                params=params,
-                neighbours=config.knn.neighbours,
-            )
-            match = register_features(task, config.registration.max_iterations, 1)
-            due = time - state.matched_at >= params.smoother.mapping_interval - _TIME_SLACK
-            lost = ((match.status == TOO_FEW_MATCHES) | ~enough) & ~first
-            matched = due & ~lost & ~first
-            T_matched = within_limits(match.T_world_lidar, params.smoother) @ state.nav.T_imu_lidar.inverse()
-            attitude, _ = measured_attitude(imu, end + state.nav.time_offset, guess.rotation())
-            T_matched = drawn_to_tilt(T_matched, attitude, params.smoother.tilt_weight)
-            T_world_imu = jaxlie.SE3(jnp.where(matched, T_matched.wxyz_xyz, guess.wxyz_xyz))
+            match = scan_to_map(config, params, state, clock, points, prediction, imu, features.enough)
         with jax.named_scope("smooth"):
-            intervals = sample_intervals(imu, state.nav.time_offset, end - interval, end)
-            latest = state.window.latest()
-            link = preintegrate_parallel(intervals, latest.gyro_bias, latest.accel_bias, params.imu)
-            measured = match_as_measurement(config, params, T_world_imu, match, _arm_squared(points), matched)
-            window, smoothed = append_and_update(
-                state.window,
-                Added(link, measured),
-                max_iterations=config.lio_sam.smoother_iterations,
-                tolerance=params.smoother.tolerance,
-            )
-            failed = runs_away(window.latest(), params) & ~first
-            # neither the samples that led astray nor a match that began at their prediction
-            place = state.nav.T_world_imu.translation() + interval * odometry.velocity
-            coasted = jaxlie.SE3.from_rotation_and_translation(guess.rotation(), place)
-            T_world_imu = jaxlie.SE3(jnp.where(failed, coasted.wxyz_xyz, T_world_imu.wxyz_xyz))
-            fresh = opened(config, params, _at_rest(state.nav, T_world_imu), params.smoother.degenerate_sigma)
-            window = jax.tree.map(
-                lambda old, new, anew: jnp.where(first, old, jnp.where(failed, anew, new)),
-                state.window,
-                window,
-                fresh,
-            )
-            # of the window that is kept, whichever it is
-            normal = jax.lax.cond(
-                first | failed,
-                lambda kept, _: linearise(kept.chain, information_of(kept.chain), kept.states),
-                lambda _, normal: normal,
-                window,
-                smoothed.normal,
-            )
-            smoothed = dataclasses.replace(smoothed, states=window.states, normal=normal)
-        nav = dataclasses.replace(_as_nav(state.nav, window), T_world_imu=T_world_imu)
+            smoothing = smooth(config, params, state, clock, points, prediction, imu, match)
+        nav = dataclasses.replace(as_nav(state.nav, smoothing.window), T_world_imu=smoothing.T_world_imu)
         with jax.named_scope("keyframe"):
-            # the map is a constant of the derivative
-            T_world_lidar, still = jax.lax.stop_gradient((lidar_pose(nav), points))
-            away = time - jnp.maximum(state.matched_at, 0.0) > params.limits.outage
-            # where the map does not reach, a new piece of it begins at the prediction
-            sound = ((matched | (lost & enough & away)) & ~failed) | (first & seen)
-            keyframe = sound & is_due(state.map.keyframes, T_world_lidar, params.submap)
-            submap, frames, placed, added = with_scan(
-                state.map, keyframe, still, T_world_lidar, jax.lax.stop_gradient(time), params
-            )
+            added = keyframe(params, state, clock, points, nav, features, match, smoothing.failed)
         new_state = State(
             nav=nav,
-            window=window,
-            time=time,
-            matched_at=jnp.where(matched, time, state.matched_at),
-            scans=state.scans + seen.astype(jnp.int32),
-            map=submap,
+            window=smoothing.window,
+            time=clock.time,
+            matched_at=jnp.where(match.used, clock.time, state.matched_at),
+            scans=state.scans + features.seen.astype(jnp.int32),
+            map=added.submap,
         )
-        corners, surfaces = len(placed.corner), len(placed.surface)
-        unfinished = (match.status == CONVERGED) & (smoothed.status != CONVERGED) & ~first
-        offset = (frames.corner.origin - frames.surface.origin).astype(placed.corner.dtype)
-        return new_state, Output(
-            registration=dataclasses.replace(
-                match,
-                T_world_lidar=lidar_pose(nav),
-                status=jnp.where(unfinished, ITERATION_LIMIT, match.status),
-            ),
-            lost=lost,
-            nis=jnp.zeros_like(end),
-            nis_dof=jnp.int32(0),
-            points=jnp.concatenate([placed.corner + offset, placed.surface]),
-            points_mask=jnp.concatenate([placed.corner_mask, placed.surface_mask]),
-            added=jnp.concatenate([added[0].added[:corners], added[1].added[:surfaces]]),
-            origin=frames.surface.origin,
-            thinned_away=thinned_away + features.dropped,
-            map_dropped=added[0].dropped + added[1].dropped,
-            covariance=_covariance(smoothed, window),
-            log_evidence=log_evidence(window.chain, smoothed),
-            corners=jnp.arange(corners + surfaces) < corners,
-            restarted=failed,
-            smoother_unfinished=unfinished,
-        )
+        return new_state, _output(nav, clock, features, match, smoothing, added)
 
 
-_TIME_SLACK = 1e-3
-"""Sweeps do not end to the last bit in time, s."""
-
-
-def _as_nav(nav: NavState, window: Window) -> NavState:
-    """Return the navigation state with the latest of the window's."""
-    latest = window.latest()
-    return dataclasses.replace(
-        nav,
-        T_world_imu=jaxlie.SE3(latest.T_world_imu.wxyz_xyz),
-        velocity=latest.velocity,
-        gyro_bias=latest.gyro_bias,
-        accel_bias=latest.accel_bias,
+def _output(
+    nav: NavState, clock: Clock, features: Features, match: MapMatch, smoothing: Smoothing, added: Addition
+) -> Output:
+    found, smoothed, placed, frames = match.registration, smoothing.smoothed, added.placed, added.frames
+    unfinished = (found.status == CONVERGED) & (smoothed.status != CONVERGED) & ~clock.first
+    offset = (frames.corner.origin - frames.surface.origin).astype(placed.corner.dtype)
+    corners, surfaces = len(placed.corner), len(placed.surface)
+    return Output(
+        registration=dataclasses.replace(
+            found,
+            T_world_lidar=lidar_pose(nav),
+            status=jnp.where(unfinished, ITERATION_LIMIT, found.status),
+        ),
+        lost=match.lost,
+        nis=jnp.zeros_like(clock.end),
+        nis_dof=jnp.int32(0),
+        points=jnp.concatenate([placed.corner + offset, placed.surface]),
+        points_mask=jnp.concatenate([placed.corner_mask, placed.surface_mask]),
+        added=jnp.concatenate([added.corner.added[:corners], added.surface.added[:surfaces]]),
+        origin=frames.surface.origin,
+        thinned_away=features.dropped,
+        map_dropped=added.corner.dropped + added.surface.dropped,
+        covariance=_covariance(smoothed, smoothing.window),
+        log_evidence=log_evidence(smoothing.window.chain, smoothed),
+        corners=jnp.arange(corners + surfaces) < corners,
+        restarted=smoothing.failed,
+        smoother_unfinished=unfinished,
     )
-
-
-def _at_rest(nav: NavState, T_world_imu: jaxlie.SE3) -> NavState:
-    """Return what the smoother begins with after a failure: any velocity is as likely."""
-    zero = jnp.zeros_like(nav.velocity)
-    return dataclasses.replace(nav, T_world_imu=T_world_imu, velocity=zero, gyro_bias=zero, accel_bias=zero)
-
-
-def _compensated(
-    corner: FeatureCloud, surface: FeatureCloud, path: Path, T_imu_lidar: jaxlie.SE3
-) -> FeaturePoints:
-    """Return features as the sensor would have seen them from where it was at the scan's end."""
-    return FeaturePoints(
-        corner=deskew_along(path, T_imu_lidar, corner.points, corner.time),
-        corner_mask=corner.mask,
-        surface=deskew_along(path, T_imu_lidar, surface.points, surface.time),
-        surface_mask=surface.mask,
-    )
-
-
-def _arm_squared(points: FeaturePoints) -> Float[Array, ""]:
-    """Return the mean squared distance of a scan's features from the sensor, m^2."""
-    both = jnp.concatenate([points.corner, points.surface])
-    mask = jnp.concatenate([points.corner_mask, points.surface_mask])
-    total = jnp.sum(jnp.where(mask[:, None], both, 0.0) ** 2)
-    return (total / jnp.maximum(jnp.sum(mask), 1)).astype(state_dtype())
 
 
 def _covariance(smoothed: Smoothed, window: Window) -> Float[Array, "24 24"]:

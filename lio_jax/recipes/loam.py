@@ -18,8 +18,8 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.leaf import section, static
+from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, LOST
 from lio_jax.core.types import ImuBatch, NavState, Scan, initial_nav_state
-from lio_jax.lidar.deskew import deskew_constant_velocity
 from lio_jax.lidar.features import (
     FeatureCloud,
     LoamFeatures,
@@ -29,16 +29,16 @@ from lio_jax.lidar.features import (
     thinned_features,
 )
 from lio_jax.lidar.params import LidarParams, LoamFeatureParams, LoamRingConfig
+from lio_jax.mapping.cube_map import added_to
+from lio_jax.mapping.feature_map import FeatureMap, FeaturePoints, empty_feature_map, frames_at, placed_in
 from lio_jax.mapping.params import CubeGridParams, FeatureMapParams, MapConfig, PointMapParams
 from lio_jax.recipes import recipe
 from lio_jax.recipes.output import Output
 from lio_jax.recipes.params import RecipeConfig, RecipeParams
 from lio_jax.recipes.recipe import Needs, Recipe
-from lio_jax.registration.cube_map import ScanToCubes, added_to
-from lio_jax.registration.feature_icp import register_features
-from lio_jax.registration.feature_map import FeatureMap, empty_feature_map, frames_at, placed_in
-from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES, Registration
-from lio_jax.registration.lines_and_planes import FeaturePoints
+from lio_jax.recipes.trial_motion import TrialMotion
+from lio_jax.registration.feature_match import ScanToCubes
+from lio_jax.registration.gauss_newton import Registration, gauss_newton
 from lio_jax.registration.params import (
     GaussNewtonMatch,
     KnnConfig,
@@ -47,6 +47,7 @@ from lio_jax.registration.params import (
     RobustMatch,
     ScanToScanParams,
 )
+from lio_jax.registration.scan_match import FixedPoints
 from lio_jax.registration.scan_to_scan import LastScan, ScanToScan, empty_scan, last_scan
 
 
@@ -188,18 +189,22 @@ class Loam(Recipe[Config, Params, State]):
                 jnp.sum(features.sharp.mask) + jnp.sum(features.flat.mask) > params.registration.min_matches
             )
         with jax.named_scope("predict"):
-            middle = 0.5 * scan.duration.astype(state.twist.dtype)
-            # the first scan's end is the world's origin, however many empty scans went before
-            interval = jnp.where(first, 0.0, scan.interval.astype(state.twist.dtype))
-            elapsed = state.since + interval - middle
-            motion = _Motion(state.twist, elapsed, ~first & (elapsed > 0), middle)
+            motion = TrialMotion.since(state.twist, state.since, scan, first)
+            middle = motion.middle
         with jax.named_scope("scan_to_scan"):
             picks = _Compensated(features.sharp, features.flat, motion, config.loam.compensate)
-            prediction = jaxlie.SE3.exp(elapsed * state.twist)
             # no velocity is known yet
             opening = (state.scans == 1) | jnp.all(state.twist == 0)
-            odometry = register_features(
-                ScanToScan(last=state.map.last, compensated=picks, T_predicted=prediction, params=params),
+            match = ScanToScan(
+                points_at=picks,
+                T_predicted=motion.predicted(),
+                registration=params.registration,
+                lidar=params.lidar,
+                last=state.map.last,
+                limits=params.scan_to_scan,
+            )
+            odometry = gauss_newton(
+                match,
                 jnp.where(opening, jnp.int32(config.loam.opening_rounds), jnp.int32(config.loam.rounds)),
                 config.registration.max_iterations,
             )
@@ -214,14 +219,22 @@ class Loam(Recipe[Config, Params, State]):
             guess = state.T_map_odom @ T_odom_lidar
             its_turn = state.scans % config.loam.mapping_every == 0
             mapping = _mapped(config, params, state.map.cubes, thin, guess, odometry, its_turn)
-            lost = (mapping.status == TOO_FEW_MATCHES) & ~first
+            lost = (mapping.status == LOST) & ~first
             T = mapping.T_world_lidar
         with jax.named_scope("insert"):
             # the map is a constant of the derivative
             last = _last(config, features, motion, jax.lax.stop_gradient(odometry.T_world_lidar))
-            frames = frames_at(jax.lax.stop_gradient(T.translation()), params)
+            frames = frames_at(jax.lax.stop_gradient(T.translation()), params.map)
             placed = jax.lax.stop_gradient(placed_in(frames, thin, T))
-            cubes, *added = added_to(state.map.cubes, placed, its_turn & ~lost, frames, params)
+            cubes, *added = added_to(
+                state.map.cubes,
+                placed,
+                its_turn & ~lost,
+                frames,
+                params.map,
+                params.point_map,
+                params.cubes,
+            )
 
         T_world_imu = T @ jaxlie.SE3.exp(middle * twist) @ params.extrinsics.T_imu_lidar().inverse()
         velocity = T_world_imu.rotation() @ (params.extrinsics.T_imu_lidar().adjoint() @ twist)[:3]
@@ -231,7 +244,7 @@ class Loam(Recipe[Config, Params, State]):
         of_odometry = jax.tree.map(
             lambda new, old: jnp.where(enough, new, old),
             of_odometry,
-            (state.T_odom_lidar, state.since + interval, state.map.last),
+            (state.T_odom_lidar, motion.to_end, state.map.last),
         )
         new_state = State(
             nav=nav,
@@ -258,39 +271,18 @@ class Loam(Recipe[Config, Params, State]):
         )
 
 
-class _Motion(eqx.Module):
-    """The motion since the scan to match with, as long as its end is under trial."""
-
-    last_twist: Float[Array, "6"]
-    elapsed: Float[Array, ""]
-    known: Bool[Array, ""]
-    middle: Float[Array, ""]
-    """Time of the scan's middle, s from its start."""
-
-    def twist_to(self, T_last_lidar: jaxlie.SE3) -> Float[Array, "6"]:
-        """Return the constant twist that leads to a pose; the last one where there was no scan before."""
-        return jnp.where(
-            self.known, T_last_lidar.log() / jnp.where(self.known, self.elapsed, 1.0), self.last_twist
-        )
-
-    def at_middle(self, cloud: FeatureCloud, T_last_lidar: jaxlie.SE3) -> Float[Array, "n 3"]:
-        """Return a cloud as the sensor would have seen it from where it was in the scan's middle."""
-        delay = cloud.time - self.middle.astype(cloud.time.dtype)
-        return deskew_constant_velocity(cloud.points, delay, self.twist_to(T_last_lidar))
-
-
 class _Compensated(eqx.Module):
     """Corners and surface points, compensated by the motion that a trial pose implies."""
 
     corner: FeatureCloud
     surface: FeatureCloud
-    motion: _Motion
+    motion: TrialMotion
     wanted: bool = eqx.field(static=True)
 
     def __call__(self, T_last_lidar: jaxlie.SE3) -> FeaturePoints:
         """Return the points in the lidar frame of the scan's middle."""
         corner, surface = (
-            self.motion.at_middle(cloud, T_last_lidar) if self.wanted else cloud.points
+            self.motion.compensated(cloud.points, cloud.time, T_last_lidar) if self.wanted else cloud.points
             for cloud in (self.corner, self.surface)
         )
         return FeaturePoints(corner, self.corner.mask, surface, self.surface.mask)
@@ -308,10 +300,18 @@ def _mapped(
     """Return the match with the map, or that with the last scan if it is not the map's turn."""
 
     def with_map() -> Registration:
-        task = ScanToCubes(
-            map=cubes, points=points, T_predicted=guess, params=params, neighbours=config.knn.neighbours
+        match = ScanToCubes(
+            points_at=FixedPoints(points),
+            T_predicted=guess,
+            registration=params.registration,
+            lidar=params.lidar,
+            map=cubes,
+            map_params=params.map,
+            knn=params.knn,
+            neighbours=config.knn.neighbours,
+            cubes=params.cubes,
         )
-        found = register_features(task, config.loam.rounds, config.registration.max_iterations)
+        found = gauss_newton(match, config.loam.rounds, config.registration.max_iterations)
         # the points' compensation rests on the odometry
         unfinished = (found.status == CONVERGED) & (odometry.status == ITERATION_LIMIT)
         return dataclasses.replace(found, status=jnp.where(unfinished, ITERATION_LIMIT, found.status))
@@ -323,10 +323,9 @@ def _mapped(
     )
 
 
-def _last(config: Config, features: LoamFeatures, motion: _Motion, T_last_lidar: jaxlie.SE3) -> LastScan:
+def _last(config: Config, features: LoamFeatures, motion: TrialMotion, T_last_lidar: jaxlie.SE3) -> LastScan:
     """Return what the next scan is matched with."""
     clouds = features.less_sharp, features.less_flat
-    corner, surface = (
-        motion.at_middle(cloud, T_last_lidar) if config.loam.compensate else cloud.points for cloud in clouds
-    )
-    return last_scan(*clouds, corner.astype(jnp.float32), surface.astype(jnp.float32), config.features.rings)
+    points = _Compensated(*clouds, motion, config.loam.compensate)(T_last_lidar)
+    corner, surface = points.corner.astype(jnp.float32), points.surface.astype(jnp.float32)
+    return last_scan(*clouds, corner, surface, config.features.rings)

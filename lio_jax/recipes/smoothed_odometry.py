@@ -9,12 +9,11 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from lio_jax.core.error_state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
-from lio_jax.core.geometry import from_blocks
+from lio_jax.core.geometry import adjoint, from_blocks
 from lio_jax.core.types import NavState
 from lio_jax.estimation.marginal_prior import gaussian_prior
 from lio_jax.estimation.motion_state import DOF, POSE_DOF, MotionState
 from lio_jax.estimation.pose_factors import PoseMeasurement, fixed_information
-from lio_jax.estimation.pose_logarithm import adjoint
 from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.estimation.sliding_window import Added, Window, open_window, still_link
 from lio_jax.recipes.lio_sam_params import Config, Params

@@ -1,7 +1,9 @@
-"""What the scan matches' Gauss-Newton solves share: normal equations of a pose, observed steps, the result.
+"""Solve a scan match by Gauss-Newton: robust, aware of degenerate directions, with the implicit derivative.
 
 A step turns a pose about its own position and moves it, in the axes of the frame it is given in.
 """
+
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,10 +12,11 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.geometry import rotation_matrix
-from lio_jax.registration.params import RegistrationParams
-
-CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES = 0, 1, 2
-"""Status codes of a solve."""
+from lio_jax.core.implicit import Problem, Solution, implicit
+from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, LOST
+from lio_jax.registration.association import Association
+from lio_jax.registration.params import GaussNewtonMatch, RegistrationParams
+from lio_jax.registration.scan_match import NormalEquations, ScanMatch
 
 
 class Registration(eqx.Module):
@@ -32,36 +35,7 @@ class Registration(eqx.Module):
     iterations: Int32[Array, ""]
     """Number of Gauss-Newton steps."""
     status: Int32[Array, ""]
-    """CONVERGED, ITERATION_LIMIT or TOO_FEW_MATCHES; in the last case the pose is the prediction."""
-
-
-class NormalEquations(eqx.Module):
-    """The solve linearised at one pose, in world axes at the sensor's position."""
-
-    hessian: Float[Array, "6 6"]
-    """Gauss-Newton Hessian of half the weighted squared error."""
-    gradient: Float[Array, "6"]
-    """Gradient of half the weighted squared error."""
-    matches: Int32[Array, ""]
-    """Number of matched points."""
-    weight: Float[Array, ""]
-    """Sum of the robust weights."""
-    squared_error: Float[Array, ""]
-    """Robustly weighted sum of squared distances, m^2."""
-    arm_squared: Float[Array, ""]
-    """Mean squared distance of the points from the sensor, m^2: scales rotations to metres."""
-
-    @staticmethod
-    def nothing(dtype: jnp.dtype) -> "NormalEquations":
-        """Return the equations of no points."""
-        zero = jnp.zeros((), dtype)
-        return NormalEquations(jnp.zeros((6, 6), dtype), jnp.zeros(6, dtype), jnp.int32(0), zero, zero, zero)
-
-    def rmse(self) -> Float[Array, ""]:
-        """Return the robustly weighted root mean square distance to the map, m; 0 without matches."""
-        some = (self.weight > 0) & (self.squared_error > 0)
-        mean = jnp.where(some, self.squared_error, 1.0) / jnp.where(some, self.weight, 1.0)
-        return jnp.where(some, jnp.sqrt(mean), 0.0)
+    """CONVERGED, ITERATION_LIMIT or LOST; in the last case the pose is the prediction."""
 
 
 class Directions(eqx.Module):
@@ -108,49 +82,111 @@ def observable_step(
     return scale * (vectors @ along), Directions(scale[:, None] * vectors, degenerate)
 
 
-def unmet(
-    T_world_lidar: jaxlie.SE3,
-    T_predicted: jaxlie.SE3,
-    directions: Directions,
-    gradient: Float[Array, "6"],
-) -> Float[Array, "6"]:
-    """Return what vanishes at a solution: the gradient where observed, else the way from the prediction.
+def gauss_newton(
+    match: ScanMatch[Any, Any], max_searches: int | Int32[Array, ""], max_steps: int = 1
+) -> Registration:
+    """Find the pose at which a scan fits its map best, by the match's robust measure.
+
+    The loop searches what each point lies on, then takes a few steps. A search whose first step ends the
+    iteration is the last. Directions that the matches do not constrain keep the prediction (Zhang, Kaess &
+    Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016).
+
+    Derivatives are those of the converged pose with the last associations, the kernel and the held directions
+    fixed (:mod:`lio_jax.core.implicit`); where the status is ITERATION_LIMIT they are not to be trusted.
 
     Args:
-        T_world_lidar: a pose at the solution or near it.
-        T_predicted: what the solve began at.
-        directions: of its last step.
-        gradient: at ``T_world_lidar``.
+        match: scan, map and prediction.
+        max_searches: bound of the outer loop.
+        max_steps: Gauss-Newton steps at most after each search.
     """
-    turn = (T_world_lidar.rotation() @ T_predicted.rotation().inverse()).log()
-    way = jnp.concatenate([turn, T_world_lidar.translation() - T_predicted.translation()])
+    problem = Problem(
+        lambda inputs: _solve(max_steps, *inputs),
+        lambda step, end, inputs: _linearised_again(step, end, inputs[1]),
+        lambda step, equations, end, inputs: _residual(step, equations, end, inputs[1]),
+        lambda step, equations, end, inputs: equations,
+    )
+    step, end, equations = implicit(problem, (jnp.asarray(max_searches, jnp.int32), match))
+    return _registration_at(moved(end.T_world_lidar, step), equations, end, match)
+
+
+class _End(eqx.Module):
+    """Where the iteration ended, and by what choices."""
+
+    T_world_lidar: jaxlie.SE3
+    iterations: Int32[Array, ""]
+    done: Bool[Array, ""]
+    association: Association[Any]
+    directions: Directions
+    """The directions of the last step."""
+
+
+def _solve(max_steps: int, max_searches: Int32[Array, ""], match: ScanMatch[Any, Any]) -> Solution:
+    settings = match.registration
+    assert isinstance(settings, GaussNewtonMatch)
+
+    def search(carry: tuple) -> tuple:
+        count, _, end, equations = carry
+        association = match.associated(end.association, end.T_world_lidar)
+
+        def iterate(carry: tuple) -> tuple:
+            number, T, *_ = carry
+            iteration = end.iterations + number
+            equations = match.linearise(T, association.found, iteration)
+            step, directions = observable_step(equations, settings.degeneracy_ratio)
+            done = is_small(step, settings) & match.settled(iteration)
+            done = done | (equations.matches < settings.min_matches)
+            return number + 1, moved(T, step), done, directions, equations
+
+        def unfinished(carry: tuple) -> Array:
+            return (carry[0] < max_steps) & ~carry[2]
+
+        first = (jnp.int32(0), end.T_world_lidar, jnp.array(False), end.directions, equations)
+        number, T, done, directions, equations = jax.lax.while_loop(unfinished, iterate, first)
+        end = _End(T, end.iterations + number, done, association, directions)
+        return count + 1, done & (number == 1), end, equations
+
+    dtype = match.T_predicted.wxyz_xyz.dtype
+    start = _End(match.T_predicted, jnp.int32(0), jnp.array(False), match.start(), Directions.none(dtype))
+    _, _, end, equations = jax.lax.while_loop(
+        lambda carry: (carry[0] < max_searches) & ~carry[1],
+        search,
+        (jnp.int32(0), jnp.array(False), start, NormalEquations.nothing(dtype)),
+    )
+    return Solution(jnp.zeros(6, dtype), end, equations)
+
+
+def _linearised_again(step: Float[Array, "6"], end: _End, match: ScanMatch[Any, Any]) -> NormalEquations:
+    """Linearise once more at a pose near the solution, with the associations found."""
+    return match.linearise(moved(end.T_world_lidar, step), end.association.found, end.iterations - 1)
+
+
+def _residual(
+    step: Float[Array, "6"], equations: NormalEquations, end: _End, match: ScanMatch[Any, Any]
+) -> Float[Array, "6"]:
+    """Return what vanishes at the solution: the gradient where observed, else the way from the prediction."""
+    T, directions = moved(end.T_world_lidar, step), end.directions
+    turn = (T.rotation() @ match.T_predicted.rotation().inverse()).log()
+    way = jnp.concatenate([turn, T.translation() - match.T_predicted.translation()])
     along = jnp.linalg.solve(directions.vectors, way)
     held = along - jax.lax.stop_gradient(along)
-    return jnp.where(directions.degenerate, held, directions.vectors.T @ gradient)
+    return jnp.where(directions.degenerate, held, directions.vectors.T @ equations.gradient)
 
 
-def registration_at(
-    T_world_lidar: jaxlie.SE3,
-    T_predicted: jaxlie.SE3,
-    equations: NormalEquations,
-    directions: Directions,
-    iterations: Int32[Array, ""],
-    done: Bool[Array, ""],
-    settings: RegistrationParams,
+def _registration_at(
+    T_world_lidar: jaxlie.SE3, equations: NormalEquations, end: _End, match: ScanMatch[Any, Any]
 ) -> Registration:
     """Return the result of a solve that ended at a pose, or at the prediction if it found too few matches."""
-    T = T_world_lidar
+    T, settings = T_world_lidar, match.registration
     lost = (equations.matches < settings.min_matches) | ~jnp.all(jnp.isfinite(T.wxyz_xyz))
-    T = jaxlie.SE3(jnp.where(lost, T_predicted.wxyz_xyz, T.wxyz_xyz))
+    T = jaxlie.SE3(jnp.where(lost, match.T_predicted.wxyz_xyz, T.wxyz_xyz))
     to_body = jax.scipy.linalg.block_diag(*[rotation_matrix(T.rotation())] * 2)
+    status = jnp.where(lost, LOST, jnp.where(end.done, CONVERGED, ITERATION_LIMIT))
     return Registration(
         T_world_lidar=T,
         information=jnp.where(lost, 0.0, to_body.T @ equations.hessian @ to_body),
-        degenerate=directions.degenerate,
+        degenerate=end.directions.degenerate,
         matches=equations.matches,
         rmse=equations.rmse(),
-        iterations=iterations,
-        status=jnp.where(lost, TOO_FEW_MATCHES, jnp.where(done, CONVERGED, ITERATION_LIMIT)).astype(
-            jnp.int32
-        ),
+        iterations=end.iterations,
+        status=status.astype(jnp.int32),
     )

@@ -1,4 +1,4 @@
-"""Scan to map by planes through nearest neighbours (FAST-LIO2): association, fit and normal equations."""
+"""Match a scan with planes through its nearest neighbours in a map of points (FAST-LIO2)."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -7,11 +7,14 @@ from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.geometry import eigenvalues_and_normal3
 from lio_jax.core.xla import computed_once
+from lio_jax.lidar.params import LidarParams
+from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.nearest_points import nearest_points
-from lio_jax.mapping.point_map import PointMap
-from lio_jax.registration.gauss_newton import NormalEquations
-from lio_jax.registration.params import Params, ScoredFitParams
-from lio_jax.registration.voxel_plane_icp import Frame
+from lio_jax.mapping.params import MapParams
+from lio_jax.mapping.point_map import EDGE, PointMap
+from lio_jax.mapping.voxel_map import anchor_of
+from lio_jax.registration.params import KnnParams, ScoredFitParams
+from lio_jax.registration.scan_match import NormalEquations, ScanMatch
 
 _Coordinates = Float32[Array, "n k"]
 """One coordinate of n points in each of k columns."""
@@ -40,17 +43,18 @@ def associate(
     mask: Bool[Array, " k"],
     T_world_lidar: jaxlie.SE3,
     frame: Frame,
-    params: Params,
+    map_params: MapParams,
+    knn: KnnParams,
     neighbours: int,
 ) -> Planes:
     """Return the plane through the nearest map points of each point at a pose.
 
-    A plane is valid if all neighbours lie within ``params.knn.radius`` of the point and within
-    ``params.knn.plane_tolerance`` of the plane.
+    A plane is valid if all neighbours lie within ``knn.radius`` of the point and within
+    ``knn.plane_tolerance`` of the plane.
     """
     _, placed = frame.place(jnp.where(mask[:, None], points, 0.0), T_world_lidar)
     placed = computed_once(placed)
-    return planes_near(pmap, placed, mask, frame.anchor, params.map.voxel_size, params.knn, neighbours)
+    return planes_near(pmap, placed, mask, frame.anchor, map_params.voxel_size, knn, neighbours)
 
 
 def planes_near(
@@ -59,7 +63,7 @@ def planes_near(
     mask: Bool[Array, " k"],
     anchor: Int32[Array, "3"],
     voxel_size: Float[Array, ""],
-    knn: ScoredFitParams,
+    knn: KnnParams,
     neighbours: int,
 ) -> Planes:
     """Return the planes of :func:`associate` for points in the frame anchored at ``anchor``, m."""
@@ -151,15 +155,15 @@ def linearise(
     points: Float[Array, "k 3"],
     T_world_lidar: jaxlie.SE3,
     frame: Frame,
-    params: Params,
+    knn: ScoredFitParams,
+    lidar: LidarParams,
 ) -> NormalEquations:
     """Return the normal equations of the points' distances from their planes at a pose.
 
     A point at range r and distance d from its plane counts if 1 - w |d| / sqrt(r) exceeds a threshold
-    (``params.knn.distance_weight`` w and ``params.knn.min_score``); all that count, count alike.
+    (``knn.distance_weight`` w and ``knn.min_score``); all that count, count alike.
     """
     dtype, kind = T_world_lidar.wxyz_xyz.dtype, points.dtype
-    knn = params.knn
     arm, placed = frame.place(jnp.where(planes.valid[:, None], points, 0.0), T_world_lidar)
     (px, py, pz), (rx, ry, rz), (nx, ny, nz) = computed_once(
         (tuple(placed.T), tuple(arm.T), tuple(planes.normal.T))
@@ -174,7 +178,7 @@ def linearise(
     columns = (ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx, nx, ny, nz, distance)
     rows = jnp.stack([counts * column for column in columns] + [counts], 0)
     sums = (rows @ rows.T).astype(dtype)
-    precision = 1 / params.lidar.range_sigma**2
+    precision = 1 / lidar.range_sigma**2
     count = sums[7, 7]
     return NormalEquations(
         hessian=precision * sums[:6, :6],
@@ -184,3 +188,35 @@ def linearise(
         squared_error=sums[6, 6],
         arm_squared=(jnp.sum(counts * range_squared) / jnp.maximum(jnp.sum(counts), 1.0)).astype(dtype),
     )
+
+
+class ScanToPoints(ScanMatch[Array, Planes]):
+    """A scan against the planes through its nearest neighbours in a map of points."""
+
+    map: PointMap
+    mask: Bool[Array, " k"]
+    """Which points are real."""
+    map_params: MapParams
+    knn: ScoredFitParams
+    lidar: LidarParams
+    neighbours: int = eqx.field(static=True)
+
+    def together(self, points: Float[Array, "k 3"]) -> tuple[Float[Array, "k 3"], Bool[Array, " k"]]:
+        return points, self.mask
+
+    def unmatched(self) -> Planes:
+        return no_planes(self.mask)
+
+    def associate(self, points: Float[Array, "k 3"], T_world_lidar: jaxlie.SE3) -> Planes:
+        settings = self.map_params, self.knn, self.neighbours
+        return associate(self.map, points, self.mask, T_world_lidar, self.frame(), *settings)
+
+    def linearise(
+        self, T_world_lidar: jaxlie.SE3, found: Planes, iteration: Int32[Array, ""]
+    ) -> NormalEquations:
+        points = self.points_at(T_world_lidar)
+        return linearise(found, points, T_world_lidar, self.frame(), self.knn, self.lidar)
+
+    def frame(self) -> Frame:
+        """Return the frame of the matches, near the sensor."""
+        return Frame(*anchor_of(self.T_predicted.translation(), EDGE * self.map_params.voxel_size))

@@ -14,11 +14,12 @@ from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from lio_jax.core.geometry import across, eigenvalues_and_normal3
 from lio_jax.core.xla import computed_once
+from lio_jax.mapping.feature_map import FeaturePoints, Frames
+from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.point_map import PointMap
-from lio_jax.registration.gauss_newton import NormalEquations
 from lio_jax.registration.knn_planes import Planes, match_score, neighbours_within, no_planes, spread
-from lio_jax.registration.params import Any
-from lio_jax.registration.voxel_plane_icp import Frame
+from lio_jax.registration.params import LineFitParams, ScoredFitParams
+from lio_jax.registration.scan_match import NormalEquations
 
 _Coordinates = Float32[Array, "n k"]
 """One coordinate of n points in each of k columns."""
@@ -31,28 +32,6 @@ class Lines(eqx.Module):
     """First plane through each line."""
     second: Planes
     """Second plane through each line, normal to the first."""
-
-
-class FeaturePoints(eqx.Module):
-    """Corners and surface points of a scan, m, lidar frame of one instant."""
-
-    corner: Float[Array, "c 3"]
-    """Corners, m."""
-    corner_mask: Bool[Array, " c"]
-    """True where a corner is real."""
-    surface: Float[Array, "s 3"]
-    """Surface points, m."""
-    surface_mask: Bool[Array, " s"]
-    """True where a surface point is real."""
-
-
-class Frames(eqx.Module):
-    """The frames of the lines and of the planes, which may come from maps with different grids."""
-
-    corner: Frame
-    """Frame of the lines."""
-    surface: Frame
-    """Frame of the planes."""
 
 
 class LinesAndPlanes(eqx.Module):
@@ -113,7 +92,7 @@ def lines_near(
     mask: Bool[Array, " k"],
     anchor: Int32[Array, "3"],
     voxel_size: Float[Array, ""],
-    knn: Any,
+    knn: LineFitParams,
     neighbours: int,
 ) -> Lines:
     """Return the line through the nearest map points of each point.
@@ -159,7 +138,7 @@ def huber(kernel: Float[Array, ""]) -> Weights:
     return Weights(weight, weight)
 
 
-def scored(knn: Any) -> Weights:
+def scored(knn: ScoredFitParams) -> Weights:
     """Return LIO-SAM's weights: the squared score s of a match, or 0 where it is not above ``min_score``.
 
     s = 1 - w d for a corner and 1 - w d / sqrt(r) for a surface point at range r (``distance_weight`` w); it

@@ -1,7 +1,6 @@
 """Parameters of scan matching; a recipe's section inherits those that its parts read."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import equinox as eqx
 
@@ -30,7 +29,7 @@ class ThinnedMatch(eqx.Module):
     """The scan is thinned to one point per cube of this edge length before it is matched."""
 
 
-class RobustMatch(eqx.Module):
+class RobustMatch(RegistrationParams):
     """A match with a robust kernel."""
 
     kernel: Scalar = leaf(0.15, "m", above=0, tuned="log")
@@ -58,6 +57,10 @@ class FilterMatch(RegistrationParams, WeighedMatch):
     inertial_degeneracy_ratio: Scalar = leaf(0.003, least=0, most=1)
     """Degeneracy ratio in a filter. It is lower than without a prediction, because the filter weighs weak
     information, such as a few trees on a plain, against the covariance of its prediction."""
+
+
+class RobustFilterMatch(FilterMatch, RobustMatch):
+    """A match with a robust kernel that updates a filter."""
 
 
 class ScanToScanParams(eqx.Module):
@@ -114,6 +117,3 @@ class KnnConfig:
 
     neighbours: int = static(5, least=3, why="fewer points define no plane")
     """Number of map points through which a plane is fitted."""
-
-
-Params = Any

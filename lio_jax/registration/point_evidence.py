@@ -6,16 +6,11 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from lio_jax.registration.params import Params
+from lio_jax.lidar.params import BeamParams
+from lio_jax.mapping.frame import Frame
+from lio_jax.registration.params import RobustFilterMatch
 from lio_jax.registration.point_sums import point_sums
-from lio_jax.registration.voxel_plane_icp import (
-    Frame,
-    Matches,
-    PointNoise,
-    plane_noise,
-    point_noise,
-    point_variances,
-)
+from lio_jax.registration.voxel_planes import Matches, PointNoise, plane_noise, point_noise, point_variances
 
 
 class PointEvidence(eqx.Module):
@@ -34,7 +29,8 @@ def point_evidence(
     points: Float[Array, "k 3"],
     T_world_lidar: jaxlie.SE3,
     frame: Frame,
-    params: Params,
+    lidar: BeamParams,
+    registration: RobustFilterMatch,
 ) -> PointEvidence:
     """Return the statistics of the matched points at a pose, with the weights of the solve.
 
@@ -42,23 +38,24 @@ def point_evidence(
         matches: matches of the points.
         points: m, lidar frame.
         T_world_lidar: the solution.
-        frame: frame of the matches.
-        params: traced.
+        frame: of the matches.
+        lidar: the noise of ranges and directions.
+        registration: the kernel, and how many points each counts as.
     """
     kind, dtype = points.dtype, T_world_lidar.wxyz_xyz.dtype
-    noise = point_noise(matches, points, T_world_lidar, frame, params)
+    noise = point_noise(matches, points, T_world_lidar, frame, lidar)
     # as in iteratively reweighted least squares, the weights are no part of the derivative
-    weight = jax.lax.stop_gradient(noise.weight(params.registration.kernel.astype(kind)))
+    weight = jax.lax.stop_gradient(noise.weight(registration.kernel.astype(kind)))
     sums = point_sums(
         jax.lax.stop_gradient(jnp.sum(_weighted(noise, weight), -1)),
         _rows,
         points,
         *frame.placing(T_world_lidar, kind),
-        jnp.stack(point_variances(params, kind)),
+        jnp.stack(point_variances(lidar, kind)),
         (matches, weight),
     ).astype(dtype)
     squared_error, log_det = sums
-    return PointEvidence(squared_error, log_det, params.registration.information_scale.astype(dtype))
+    return PointEvidence(squared_error, log_det, registration.information_scale.astype(dtype))
 
 
 def _rows(arm: Array, shift: Array, scales: Array, constants: tuple[Matches, Array]) -> Array:

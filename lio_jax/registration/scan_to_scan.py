@@ -3,8 +3,6 @@
 Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014, section V.B.
 """
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,18 +11,13 @@ from jaxtyping import Array, Float32
 
 from lio_jax.core.xla import computed_once
 from lio_jax.lidar.features import FeatureCloud
-from lio_jax.registration.feature_icp import ScanRegistration
+from lio_jax.mapping.feature_map import FeaturePoints, Frames
+from lio_jax.mapping.frame import Frame
+from lio_jax.registration.feature_match import FeatureMatch
 from lio_jax.registration.knn_planes import Planes
-from lio_jax.registration.lines_and_planes import (
-    FeaturePoints,
-    Frames,
-    Lines,
-    LinesAndPlanes,
-    line_through,
-)
-from lio_jax.registration.params import Params
+from lio_jax.registration.lines_and_planes import Lines, LinesAndPlanes, line_through
+from lio_jax.registration.params import ScanToScanParams
 from lio_jax.registration.ring_index import Nearest, Queries, RingIndex, nearest_by_ring, ring_index
-from lio_jax.registration.voxel_plane_icp import Frame
 
 _Vectors = tuple[Array, Array, Array]
 
@@ -63,24 +56,18 @@ def empty_scan(corners: int, surfaces: int, rings: int) -> LastScan:
     return LastScan(ring_index(jnp.zeros((len(none), 3), jnp.float32), none, none > 0, 2 * rings))
 
 
-class ScanToScan(ScanRegistration):
+class ScanToScan(FeatureMatch):
     """A scan's sharp and flat points, and the last scan. The pose sought is that in the last scan's frame."""
 
     last: LastScan
-    compensated: Callable[[jaxlie.SE3], FeaturePoints]
-    """The motion-compensated points, given the pose under trial. A pytree."""
-    T_predicted: jaxlie.SE3
-    params: Params
-
-    def points_at(self, T_target_lidar: jaxlie.SE3) -> FeaturePoints:
-        return self.compensated(T_target_lidar)
+    limits: ScanToScanParams
 
     def frames(self) -> Frames:
         # the last scan's own axes
         here = Frame(jnp.zeros(3, jnp.int32), jnp.zeros_like(self.T_predicted.translation()))
         return Frames(here, here)
 
-    def associate(self, points: FeaturePoints, T_target_lidar: jaxlie.SE3) -> LinesAndPlanes:
+    def associate(self, points: FeaturePoints, T_world_lidar: jaxlie.SE3) -> LinesAndPlanes:
         """Find lines and planes.
 
         A sharp point lies on the line through the nearest less sharp point and the nearest one of another
@@ -89,20 +76,19 @@ class ScanToScan(ScanRegistration):
         come to the same.
         """
         frame, corners = self.frames().corner, len(points.corner)
-        _, placed = frame.place(jnp.concatenate([points.corner, points.surface]), T_target_lidar)
-        mask = jnp.concatenate([points.corner_mask, points.surface_mask])
+        together, mask = points.together()
+        _, placed = frame.place(together, T_world_lidar)
         x, y, z = computed_once(tuple(jnp.where(mask[:, None], placed, 0.0).astype(jnp.float32).T))
         index = self.last.index
         rings = len(index.elevation) // 2
         lowest = jnp.where(jnp.arange(len(mask)) < corners, 0, rings).astype(jnp.int32)
-        limits = self.params.scan_to_scan
         found = nearest_by_ring(
             index,
             Queries(x, y, z, lowest),
             mask,
             rings,
-            limits.radius.astype(jnp.float32),
-            limits.rings_apart.astype(jnp.float32),
+            self.limits.radius.astype(jnp.float32),
+            self.limits.rings_apart.astype(jnp.float32),
         )
         at_corner, at_surface = (
             jax.tree.map(lambda place, part=part: place[part], found)

@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, NOT_FINITE
 from lio_jax.core.types import ImuBatch
-from lio_jax.estimation.iterated_filter import NOT_FINITE
 from lio_jax.imu.sampling import LONGEST_GAP
-from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT
 from lio_jax.settings.settings import Settings
 
 _NAMED = 0.8

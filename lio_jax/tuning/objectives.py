@@ -36,7 +36,7 @@ class Observed(eqx.Module):
     rmse: Float[Array, ""]
     """Robustly weighted root mean square distance of the scan to the map, m."""
     status: Int32[Array, ""]
-    """Of the solve, see :mod:`lio_jax.estimation.iterated_filter`."""
+    """Of the solve, see :mod:`lio_jax.core.status`."""
     lost: Bool[Array, ""]
     covariance: Float[Array, "24 24"] | None
     """Of the navigation state; None from recipes that carry none."""

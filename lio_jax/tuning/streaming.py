@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
+from lio_jax.core.status import ITERATION_LIMIT, NOT_FINITE
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.core.xla import PerShape
-from lio_jax.estimation.iterated_filter import ITERATION_LIMIT, NOT_FINITE
 from lio_jax.recipes import recipe_named
 from lio_jax.recipes.params import RecipeConfig as Config
 from lio_jax.run.track import run_steps

@@ -8,15 +8,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from lio_jax.estimation.iterated_filter import (
-    CONVERGED,
-    ITERATION_LIMIT,
-    LOST,
-    NOT_FINITE,
-    Measurement,
-    Update,
-    iterated_update,
-)
+from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, LOST, NOT_FINITE
+from lio_jax.estimation.iterated_filter import Measurement, Update, iterated_update
 
 
 def plus(state, error):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.error_state import EXTRINSIC_ROTATION, GYRO_BIAS, POSITION
+from lio_jax.core.status import LOST
 from lio_jax.recipes.fast_lio2 import FastLio2
 from lio_jax.run.scan_inputs import ImuFeed, padded
 from lio_jax.settings.settings import Settings, recipe_settings, with_extrinsics, with_overrides
@@ -129,6 +130,37 @@ def test_an_extrinsic_without_sigma_stays_to_the_last_bit():
 def empty(inputs):
     scan, samples = inputs
     return eqx.tree_at(lambda s: s.mask, scan, jnp.zeros_like(scan.mask)), samples
+
+
+@pytest.mark.parametrize("inertial", [True, False])
+def test_an_empty_scan_is_predicted_over(inertial, drive, without):
+    states, outputs, poses = run(
+        settings_with().params(), inertial, lambda n, inputs: empty(inputs) if n == 18 else inputs
+    )
+    assert outputs[18].lost
+    assert outputs[18].registration.status == LOST
+    for one, other in zip(jax.tree.leaves(states[17].map), jax.tree.leaves(states[18].map), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert not outputs[19].lost
+    assert ate(poses) < ate((drive if inertial else without)[2]) + 0.02
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((states[18].uncertain, outputs[18].nis)))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_points_that_are_not_finite_are_ignored(value):
+    def spoil(number, inputs, bad):
+        scan, samples = inputs
+        rows = jnp.arange(len(scan.mask)) % 7 == 3
+        if bad:
+            return eqx.tree_at(
+                lambda s: s.points, scan, jnp.where(rows[:, None], value, scan.points)
+            ), samples
+        return eqx.tree_at(lambda s: s.mask, scan, scan.mask & ~rows), samples
+
+    params = settings_with().params()
+    one, other = (run(params, change=partial(spoil, bad=bad), count=6) for bad in (True, False))
+    for left, right in zip(jax.tree.leaves(one[0][-1]), jax.tree.leaves(other[0][-1]), strict=True):
+        np.testing.assert_array_equal(left, right)
 
 
 def test_one_map_point_per_voxel_and_the_map_is_of_the_street(drive):

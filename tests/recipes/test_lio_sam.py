@@ -16,9 +16,9 @@ from lio_jax.core.error_state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, 
 from lio_jax.core.errors import UsageError
 from lio_jax.core.types import ImuBatch
 from lio_jax.core.xla import PerShape
+from lio_jax.mapping.feature_map import empty_feature_map
 from lio_jax.recipes.lio_sam import LioSam
 from lio_jax.recipes.smoothed_odometry import match_as_measurement
-from lio_jax.registration.feature_map import empty_feature_map
 from lio_jax.run.scan_inputs import ImuFeed, padded
 from tests.recipes.street import ate, recording, truth
 

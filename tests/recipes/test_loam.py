@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.errors import UsageError
+from lio_jax.core.status import LOST
 from lio_jax.core.xla import PerShape
 from lio_jax.recipes import loam
 from lio_jax.recipes.loam import Loam
@@ -123,6 +124,30 @@ def test_compensation_helps_a_moving_sensor(drive):
 
 def empty(scan):
     return eqx.tree_at(lambda s: s.mask, scan, jnp.zeros_like(scan.mask))
+
+
+def test_an_empty_scan_is_predicted_over(drive):
+    states, outputs, poses = run(change=lambda n, scan: empty(scan) if n == 18 else scan)
+    assert outputs[18].lost
+    assert outputs[18].registration.status == LOST
+    for one, other in zip(jax.tree.leaves(states[17].map), jax.tree.leaves(states[18].map), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert not outputs[19].lost
+    assert ate(poses) < ate(drive[2]) + 0.02
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((states[18].nav, outputs[18].nis)))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_points_that_are_not_finite_are_ignored(value):
+    def spoil(number, scan, bad):
+        rows = jnp.arange(len(scan.mask)) % 7 == 3
+        if bad:
+            return eqx.tree_at(lambda s: s.points, scan, jnp.where(rows[:, None], value, scan.points))
+        return eqx.tree_at(lambda s: s.mask, scan, scan.mask & ~rows)
+
+    one, other = (run(change=partial(spoil, bad=bad), count=5) for bad in (True, False))
+    for left, right in zip(jax.tree.leaves(one[0][-1]), jax.tree.leaves(other[0][-1]), strict=True):
+        np.testing.assert_array_equal(left, right)
 
 
 def only(scan, keep):

@@ -1,5 +1,7 @@
 """Planes through nearest neighbours against numpy's linear algebra and a brute-force association."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -7,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.point_map import EDGE, empty_map
 from lio_jax.mapping.voxel_map import anchor_of
 from lio_jax.registration.association import associated, no_association
 from lio_jax.registration.knn_planes import associate, fit_planes, linearise, no_planes
-from lio_jax.registration.voxel_plane_icp import Frame
 from lio_jax.settings.settings import recipe_settings, with_overrides
 from tests.mapping.test_nearest_points import street
 from tests.mapping.test_point_map import held, put
@@ -22,14 +24,18 @@ POSE = jaxlie.SE3.from_rotation_and_translation(
     jaxlie.SO3.from_rpy_radians(0.03, -0.02, 0.4), jnp.array([1.3, -0.7, 1.6])
 )
 FRAME = Frame(*anchor_of(POSE.translation(), EDGE * PARAMS.map.voxel_size))
-_associate = jax.jit(associate, static_argnums=6)
+
+
+@partial(jax.jit, static_argnums=6)
+def _associate(pmap, points, mask, T, frame, params, neighbours):
+    return associate(pmap, points, mask, T, frame, params.map, params.knn, neighbours)
 
 
 @jax.jit
 def _associated(last, pmap, points, mask, T, params):
     return associated(
         last,
-        lambda: associate(pmap, points, mask, T, FRAME, params, 5),
+        lambda: associate(pmap, points, mask, T, FRAME, params.map, params.knn, 5),
         points,
         mask,
         T,
@@ -37,7 +43,11 @@ def _associated(last, pmap, points, mask, T, params):
     )
 
 
-_linearise = jax.jit(linearise)
+@jax.jit
+def _linearise(planes, points, T, frame, params):
+    return linearise(planes, points, T, frame, params.knn, params.lidar)
+
+
 _fit = jax.jit(fit_planes)
 
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.voxel_map import anchor_of, empty_map, insert
-from lio_jax.registration.gauss_newton import NormalEquations
-from lio_jax.registration.voxel_plane_icp import Frame, associate, linearise
+from lio_jax.registration.scan_match import NormalEquations
+from lio_jax.registration.voxel_planes import associate, linearise
 from tests.registration.scenes import map_of, matrix, params_with, pose
 
 VOXEL, SIGMA = 1.2, 0.05
@@ -23,8 +24,8 @@ TRUTH = pose([0.7, -0.4, 0.9], [0.1, -0.2, 0.3])
 @jax.jit
 def _linearise(vmap, points, mask, T, kernel, params) -> NormalEquations:
     frame = Frame(*anchor_of(T.translation(), params.map.voxel_size))
-    matches = associate(vmap, points, mask, T, frame, params)
-    return linearise(matches, points, T, frame, kernel, params)
+    matches = associate(vmap, points, mask, T, frame, params.map)
+    return linearise(matches, points, T, frame, kernel, params.lidar)
 
 
 def patches() -> list[np.ndarray]:

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from lio_jax.mapping.feature_map import FeaturePoints, Frames
+from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.point_map import EDGE, empty_map, insert
 from lio_jax.mapping.voxel_map import anchor_of
 from lio_jax.registration.knn_planes import planes_near
 from lio_jax.registration.lines_and_planes import (
-    FeaturePoints,
-    Frames,
     LinesAndPlanes,
     fit_lines,
     huber,
@@ -20,7 +20,6 @@ from lio_jax.registration.lines_and_planes import (
     lines_near,
     no_lines_and_planes,
 )
-from lio_jax.registration.voxel_plane_icp import Frame
 from lio_jax.settings.settings import recipe_settings, with_overrides
 from tests.mapping.test_point_map import held
 from tests.registration.test_knn_planes import columns

@@ -6,9 +6,10 @@ import jaxlie
 import numpy as np
 import pytest
 
+from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.voxel_map import anchor_of
-from lio_jax.registration.gauss_newton import NormalEquations
-from lio_jax.registration.voxel_plane_icp import Frame, associate, linearise
+from lio_jax.registration.scan_match import NormalEquations
+from lio_jax.registration.voxel_planes import associate, linearise
 from tests.registration.scenes import ROOM, map_of, params_with, pose, sample, seen_from
 
 PARAMS = params_with()
@@ -21,8 +22,8 @@ MASK = np.arange(len(POINTS)) % 3 != 0
 @jax.jit
 def normal_equations(points: jax.Array, mask: jax.Array) -> NormalEquations:
     frame = Frame(*anchor_of(TRUTH.translation(), PARAMS.map.voxel_size))
-    matches = associate(MAP, points, mask, TRUTH, frame, PARAMS)
-    return linearise(matches, points, TRUTH, frame, jnp.float64(0.5), PARAMS)
+    matches = associate(MAP, points, mask, TRUTH, frame, PARAMS.map)
+    return linearise(matches, points, TRUTH, frame, jnp.float64(0.5), PARAMS.lidar)
 
 
 def spoilt(value: float) -> np.ndarray:
@@ -44,8 +45,8 @@ def cost_at(points: jax.Array, move: jax.Array) -> jax.Array:
     T = pose([0.4, -0.3, 0.2], [0.02, -0.03, 0.3])
     T = jaxlie.SE3.from_rotation_and_translation(T.rotation() @ jaxlie.SO3.exp(move[:3]), move[3:])
     frame = Frame(*anchor_of(T.translation(), PARAMS.map.voxel_size))
-    matches = associate(MAP, points, jnp.asarray(MASK), T, frame, PARAMS)
-    return linearise(matches, points, T, frame, jnp.float64(0.5), PARAMS).squared_error
+    matches = associate(MAP, points, jnp.asarray(MASK), T, frame, PARAMS.map)
+    return linearise(matches, points, T, frame, jnp.float64(0.5), PARAMS.lidar).squared_error
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

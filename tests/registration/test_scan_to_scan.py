@@ -8,11 +8,12 @@ import jaxlie
 import numpy as np
 import pytest
 
+from lio_jax.core.status import CONVERGED, LOST
 from lio_jax.lidar.features import loam_features
 from lio_jax.lidar.params import LoamRingConfig
-from lio_jax.registration.feature_icp import register_features
-from lio_jax.registration.gauss_newton import CONVERGED, TOO_FEW_MATCHES
-from lio_jax.registration.lines_and_planes import FeaturePoints
+from lio_jax.mapping.feature_map import FeaturePoints
+from lio_jax.registration.gauss_newton import gauss_newton
+from lio_jax.registration.scan_match import FixedPoints
 from lio_jax.registration.scan_to_scan import ScanToScan, empty_scan, last_scan
 from lio_jax.settings.settings import recipe_settings, with_overrides
 from tests.params import Config
@@ -30,20 +31,13 @@ def identity() -> jaxlie.SE3:
     return jaxlie.SE3(jnp.array([1.0, 0, 0, 0, 0, 0, 0], jnp.float64))
 
 
-class Still(FeaturePoints):
-    """Points that are compensated already."""
-
-    def __call__(self, T_last_lidar):
-        return self
-
-
 def prepared(number: int):
     """Return the features of a compensated scan of the hall."""
     return _features(PARAMS, scan(number, twist=SLOW, still=True))
 
 
-def picks(features) -> Still:
-    return Still(features.sharp.points, features.sharp.mask, features.flat.points, features.flat.mask)
+def picks(features) -> FeaturePoints:
+    return FeaturePoints(features.sharp.points, features.sharp.mask, features.flat.points, features.flat.mask)
 
 
 def target(features):
@@ -51,15 +45,25 @@ def target(features):
     return last_scan(*clouds, *(cloud.points for cloud in clouds), BEAMS)
 
 
+def match(last, points, prediction, params) -> ScanToScan:
+    return ScanToScan(
+        points_at=FixedPoints(points),
+        T_predicted=prediction,
+        registration=params.registration,
+        lidar=params.lidar,
+        last=last,
+        limits=params.scan_to_scan,
+    )
+
+
 @partial(jax.jit, static_argnums=(3, 4))
 def _matched(last, points, prediction, rounds=2, iterations=4, params=PARAMS):
-    task = ScanToScan(last=last, compensated=points, T_predicted=prediction, params=params)
-    return register_features(task, rounds, iterations)
+    return gauss_newton(match(last, points, prediction, params), rounds, iterations)
 
 
 @jax.jit
 def _associated(last, points, T):
-    return ScanToScan(last=last, compensated=points, T_predicted=T, params=PARAMS).associate(points, T)
+    return match(last, points, T, PARAMS).associate(points, T)
 
 
 def test_lines_and_planes_pass_through_points_of_the_right_rings():
@@ -110,7 +114,9 @@ def test_the_motion_between_two_scans_comes_back(guess_off):
 def test_without_corners_planes_alone_are_matched():
     now = prepared(1)
     points = picks(now)
-    flat_only = Still(points.corner, jnp.zeros_like(points.corner_mask), points.surface, points.surface_mask)
+    flat_only = FeaturePoints(
+        points.corner, jnp.zeros_like(points.corner_mask), points.surface, points.surface_mask
+    )
     result = _matched(target(prepared(0)), flat_only, identity(), 6, 10)
     moved = np.linalg.inv(lidar_pose(0.1, SLOW)) @ lidar_pose(0.2, SLOW)
     assert result.status == CONVERGED
@@ -124,6 +130,6 @@ def test_nothing_to_match_with_leaves_the_prediction():
         features.corners * features.sectors * features.rings, features.surface_points, features.rings
     )
     result = _matched(nothing, picks(prepared(1)), guess)
-    assert result.status == TOO_FEW_MATCHES
+    assert result.status == LOST
     np.testing.assert_array_equal(result.T_world_lidar.wxyz_xyz, guess.wxyz_xyz)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(result))

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, LOST, NOT_FINITE
 from lio_jax.core.types import ImuBatch
-from lio_jax.estimation.iterated_filter import NOT_FINITE
-from lio_jax.registration.gauss_newton import CONVERGED, ITERATION_LIMIT, TOO_FEW_MATCHES
 from lio_jax.run.failures import Evidence, failure_of, longest_gap, unobserved_directions
 from lio_jax.settings.settings import Settings, with_overrides
 
@@ -75,7 +74,7 @@ def test_no_points() -> None:
 
 
 def test_too_few_matches_name_a_gap_of_the_samples() -> None:
-    lost = match(matches=np.int32(7), status=np.int32(TOO_FEW_MATCHES))
+    lost = match(matches=np.int32(7), status=np.int32(LOST))
     assert said(registration=lost, lost=True) == (
         "7 points matched the map, 50 are needed; the pose is the prediction."
     )

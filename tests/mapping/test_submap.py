@@ -7,16 +7,15 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
+from lio_jax.mapping.feature_map import FeaturePoints, empty_feature_map, frames_at
 from lio_jax.mapping.keyframes import no_keyframes
 from lio_jax.mapping.nearest_points import nearest_points
-from lio_jax.registration.feature_map import empty_feature_map, frames_at
-from lio_jax.registration.lines_and_planes import FeaturePoints
-from lio_jax.registration.submap import Submap, with_scan
+from lio_jax.mapping.submap import Submap, with_scan
 from lio_jax.settings.settings import recipe_settings
 
 PARAMS = recipe_settings("lio_sam").params()
 CORNERS, SURFACES = 64, 256
-_add = jax.jit(partial(with_scan, params=PARAMS))
+_add = jax.jit(partial(with_scan, map_params=PARAMS.map, point_map=PARAMS.point_map, settings=PARAMS.submap))
 
 
 def points(seed: int) -> FeaturePoints:
@@ -40,7 +39,7 @@ def pose(x: float) -> jaxlie.SE3:
 
 def in_map(submap: Submap, T: jaxlie.SE3, own: FeaturePoints) -> np.ndarray:
     """Return how far each surface point, placed in world, is from the nearest one in the map, m."""
-    frame = frames_at(T.translation(), PARAMS).surface
+    frame = frames_at(T.translation(), PARAMS.map).surface
     world = np.asarray(T.apply(own.surface))[np.asarray(own.surface_mask)]
     local = jnp.asarray(world - np.asarray(frame.origin))
     size = PARAMS.map.voxel_size.astype(jnp.float32)

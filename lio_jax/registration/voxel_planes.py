@@ -1,7 +1,4 @@
-"""Register a scan against the voxel map: point-to-plane, robust Gauss-Newton, degeneracy aware."""
-
-from collections.abc import Callable
-from functools import partial
+"""Match a scan with the planes of a voxel map: point-to-plane distances, robustly weighted by their noise."""
 
 import equinox as eqx
 import jax
@@ -9,47 +6,14 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
-from lio_jax.core.geometry import rotation_matrix
-from lio_jax.core.implicit import Problem, Solution, implicit
 from lio_jax.core.xla import computed_once
+from lio_jax.lidar.params import BeamParams
+from lio_jax.mapping.frame import Frame
+from lio_jax.mapping.params import VoxelMapParams
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, query_nearest
-from lio_jax.registration.association import Association, associated, no_association
-from lio_jax.registration.gauss_newton import (
-    Directions,
-    NormalEquations,
-    Registration,
-    is_small,
-    moved,
-    observable_step,
-    registration_at,
-    unmet,
-)
-from lio_jax.registration.params import Params
+from lio_jax.registration.params import RobustMatch
 from lio_jax.registration.point_sums import point_sums
-
-
-class Frame(eqx.Module):
-    """World axes from a corner of the map's grid near the sensor: where float32 is precise."""
-
-    anchor: Int32[Array, "3"]
-    """The voxel whose lower corner is the origin."""
-    origin: Float[Array, "3"]
-    """Position of that corner, m, in world."""
-
-    def place(
-        self, points: Float[Array, "k 3"], T_world_lidar: jaxlie.SE3
-    ) -> tuple[Float[Array, "k 3"], Float[Array, "k 3"]]:
-        """Return points of the lidar frame in world axes, from the sensor and from the origin, m."""
-        R, shift = self.placing(T_world_lidar, points.dtype)
-        arm = points @ R.T
-        return arm, arm + shift
-
-    def placing(
-        self, T_world_lidar: jaxlie.SE3, dtype: jnp.dtype
-    ) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
-        """Return the turn into world axes, and the way from the sensor to the origin, m."""
-        R = rotation_matrix(T_world_lidar.rotation())
-        return R.astype(dtype), (T_world_lidar.translation() - self.origin).astype(dtype)
+from lio_jax.registration.scan_match import NormalEquations, ScanMatch
 
 
 class Matches(eqx.Module):
@@ -73,7 +37,7 @@ def associate(
     mask: Bool[Array, " k"],
     T_world_lidar: jaxlie.SE3,
     frame: Frame,
-    params: Params,
+    map_params: VoxelMapParams,
 ) -> Matches:
     """Return the distribution of the map that each point lies on at a pose."""
     _, placed = frame.place(jnp.where(mask[:, None], points, 0.0), T_world_lidar)
@@ -81,8 +45,8 @@ def associate(
         vmap,
         placed,
         frame.anchor,
-        params.map.voxel_size.astype(jnp.float32),
-        params.map.min_points.astype(jnp.float32),
+        map_params.voxel_size.astype(jnp.float32),
+        map_params.min_points.astype(jnp.float32),
     )
     return Matches(near.mean, near.normal, near.variances, near.count, mask & near.valid)
 
@@ -117,7 +81,7 @@ def point_noise(
     points: Float[Array, "k 3"],
     T_world_lidar: jaxlie.SE3,
     frame: Frame,
-    params: Params,
+    lidar: BeamParams,
 ) -> PointNoise:
     """Return the distances of associated points from their planes at a pose, and their noise.
 
@@ -130,12 +94,11 @@ def point_noise(
     """
     R, shift = frame.placing(T_world_lidar, points.dtype)
     arm = jnp.where(matches.used[:, None], points, 0.0) @ R.T
-    return plane_noise(matches, arm, shift, *point_variances(params, points.dtype))
+    return plane_noise(matches, arm, shift, *point_variances(lidar, points.dtype))
 
 
-def point_variances(params: Params, dtype: jnp.dtype) -> tuple[Array, Array]:
+def point_variances(lidar: BeamParams, dtype: jnp.dtype) -> tuple[Array, Array]:
     """Return the variances of a point along its plane's normal (m^2) and of a beam's direction (rad^2)."""
-    lidar = params.lidar
     facing = lidar.range_sigma**2 + lidar.surface_sigma**2
     return facing.astype(dtype), (lidar.angle_sigma**2).astype(dtype)
 
@@ -164,7 +127,7 @@ def linearise(
     T_world_lidar: jaxlie.SE3,
     frame: Frame,
     kernel: Float[Array, ""],
-    params: Params,
+    lidar: BeamParams,
 ) -> NormalEquations:
     """Return the robustly weighted normal equations of associated points at a pose.
 
@@ -172,7 +135,7 @@ def linearise(
     its plane's mean, with precision k and s^2 of range and surface.
     """
     dtype, kind = T_world_lidar.wxyz_xyz.dtype, points.dtype
-    noise = point_noise(matches, points, T_world_lidar, frame, params)
+    noise = point_noise(matches, points, T_world_lidar, frame, lidar)
     weight = noise.weight(kernel.astype(kind))
     arm, distance = noise.arm, noise.distance
 
@@ -196,7 +159,7 @@ def linearise(
         _rows,
         points,
         *frame.placing(T_world_lidar, kind),
-        jnp.stack([*point_variances(params, kind), kernel.astype(kind)]),
+        jnp.stack([*point_variances(lidar, kind), kernel.astype(kind)]),
         matches,
     ).astype(dtype)
     hessian, count = total[:36].reshape(6, 6), sums[7, 8]
@@ -229,123 +192,46 @@ def _rows(arm: Array, shift: Array, scales: Array, matches: Matches) -> Array:
     )
 
 
-def register(
-    vmap: VoxelMap,
-    points_at: Callable[[jaxlie.SE3], Float[Array, "k 3"]],
-    mask: Bool[Array, " k"],
-    T_world_lidar: jaxlie.SE3,
-    prediction_error: Float[Array, ""],
-    params: Params,
-    max_iterations: int,
-) -> Registration:
-    """Find the pose at which the scan fits the map best.
+class ScanToVoxels(ScanMatch[Array, Matches]):
+    """A scan against the planes of a voxel map.
 
     The kernel starts as wide as the prediction may be wrong and halves with each iteration down to its own
     scale, so that a scan without a velocity prior still finds the map (graduated non-convexity, Blake &
-    Zisserman 1987). Directions the scan does not constrain keep the prediction (Zhang & Singh, "On
-    degeneracy of optimization-based state estimation problems", ICRA 2016).
-
-    Derivatives are those of the converged pose with map, associations, kernel and held directions fixed
-    (:mod:`lio_jax.core.implicit`); where the status is ITERATION_LIMIT they are not to be trusted.
-
-    Args:
-        vmap: the map.
-        points_at: the motion-compensated points in the lidar frame, m, given the pose under trial: the
-            compensation may depend on it. A pytree, if what it holds is to be differentiated.
-        mask: which points are real.
-        T_world_lidar: predicted pose.
-        prediction_error: expected error of the prediction, m.
-        params: traced parameters.
-        max_iterations: bound of the loop.
+    Zisserman 1987).
     """
-    task = _Task(vmap, points_at, mask, T_world_lidar, prediction_error, params)
-    problem = Problem(
-        partial(_solve, max_iterations), _again, _missed, lambda step, equations, end, task: equations
-    )
-    step, end, equations = implicit(problem, task)
-    T = moved(end.T_world_lidar, step)
-    return registration_at(
-        T, T_world_lidar, equations, end.directions, end.iterations, end.done, params.registration
-    )
 
-
-class _Task(eqx.Module):
-    """What there is to register."""
-
+    registration: RobustMatch
     map: VoxelMap
-    points_at: Callable[[jaxlie.SE3], Float[Array, "k 3"]]
     mask: Bool[Array, " k"]
-    T_predicted: jaxlie.SE3
+    """Which points are real."""
     prediction_error: Float[Array, ""]
-    params: Params
+    """Expected error of the prediction, m."""
+    map_params: VoxelMapParams
+    lidar: BeamParams
+
+    def together(self, points: Float[Array, "k 3"]) -> tuple[Float[Array, "k 3"], Bool[Array, " k"]]:
+        return points, self.mask
+
+    def unmatched(self) -> Matches:
+        return no_matches(self.mask)
+
+    def associate(self, points: Float[Array, "k 3"], T_world_lidar: jaxlie.SE3) -> Matches:
+        return associate(self.map, points, self.mask, T_world_lidar, self.frame(), self.map_params)
+
+    def linearise(
+        self, T_world_lidar: jaxlie.SE3, found: Matches, iteration: Int32[Array, ""]
+    ) -> NormalEquations:
+        kernel = self.registration.kernel + self.opening(iteration)
+        points = self.points_at(T_world_lidar)
+        return linearise(found, points, T_world_lidar, self.frame(), kernel, self.lidar)
+
+    def settled(self, iteration: Int32[Array, ""]) -> Bool[Array, ""]:
+        return self.opening(iteration) < self.registration.kernel
 
     def opening(self, iteration: Int32[Array, ""]) -> Float[Array, ""]:
-        """Return by how much the kernel is still open."""
+        """Return by how much the kernel is still open, m."""
         return self.prediction_error * 0.5 ** iteration.astype(self.prediction_error.dtype)
 
-    def linearised(
-        self, T_world_lidar: jaxlie.SE3, points: Array, matches: Matches, iteration: Int32[Array, ""]
-    ) -> NormalEquations:
-        """Return the normal equations at a pose with the kernel of an iteration."""
-        kernel = self.params.registration.kernel + self.opening(iteration)
-        return linearise(matches, points, T_world_lidar, self.frame(), kernel, self.params)
-
     def frame(self) -> Frame:
-        """Return axes near the sensor."""
-        return Frame(*anchor_of(self.T_predicted.translation(), self.params.map.voxel_size))
-
-
-class _End(eqx.Module):
-    """Where the iteration ended, and by what choices."""
-
-    T_world_lidar: jaxlie.SE3
-    iterations: Int32[Array, ""]
-    done: Bool[Array, ""]
-    association: Association[Matches]
-    directions: Directions
-    """Principal directions of the last step."""
-
-
-def _solve(max_iterations: int, task: _Task) -> Solution:
-    settings = task.params.registration
-    mask, prediction = task.mask, task.T_predicted
-
-    def iterate(carry: tuple) -> tuple:
-        end, _ = carry
-        T = end.T_world_lidar
-        points = task.points_at(T)
-        association = associated(
-            end.association,
-            lambda: associate(task.map, points, mask, T, task.frame(), task.params),
-            points,
-            mask,
-            T,
-            settings.reassociation_distance,
-        )
-        equations = task.linearised(T, points, association.found, end.iterations)
-        step, directions = observable_step(equations, settings.degeneracy_ratio)
-        done = is_small(step, settings) & (task.opening(end.iterations) < settings.kernel)
-        done = done | (equations.matches < settings.min_matches)
-        following = moved(T, step)
-        return _End(following, end.iterations + 1, done, association, directions), equations
-
-    def unfinished(carry: tuple) -> Array:
-        return (carry[0].iterations < max_iterations) & ~carry[0].done
-
-    dtype = prediction.wxyz_xyz.dtype
-    nothing = no_association(no_matches(mask), prediction)
-    start = _End(prediction, jnp.int32(0), jnp.array(False), nothing, Directions.none(dtype))
-    end, equations = jax.lax.while_loop(unfinished, iterate, (start, NormalEquations.nothing(dtype)))
-    return Solution(jnp.zeros(6, dtype), end, equations)
-
-
-def _again(step: Float[Array, "6"], end: _End, task: _Task) -> NormalEquations:
-    """Linearise once more at a pose near the solution, with its associations."""
-    T = moved(end.T_world_lidar, step)
-    return task.linearised(T, task.points_at(T), end.association.found, end.iterations - 1)
-
-
-def _missed(step: Float[Array, "6"], equations: NormalEquations, end: _End, task: _Task) -> Float[Array, "6"]:
-    """Return what vanishes at the solution: the gradient where observed, else the way from the prediction."""
-    T = moved(end.T_world_lidar, step)
-    return unmet(T, task.T_predicted, end.directions, equations.gradient)
+        """Return the frame of the matches, near the sensor."""
+        return Frame(*anchor_of(self.T_predicted.translation(), self.map_params.voxel_size))

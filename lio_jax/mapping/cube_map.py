@@ -7,23 +7,15 @@ grid decides what is kept and what is matched.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from lio_jax.mapping import feature_map
+from lio_jax.mapping.feature_map import FeatureMap, FeaturePoints, Frames
+from lio_jax.mapping.frame import Frame
+from lio_jax.mapping.params import CubeGridParams, FeatureMapParams, PointMapParams
 from lio_jax.mapping.point_map import Insertion, PointMap, shift_box
-from lio_jax.registration import feature_map
-from lio_jax.registration.feature_map import FeatureMap
-from lio_jax.registration.lines_and_planes import FeaturePoints, Frames
-from lio_jax.registration.params import Params
-from lio_jax.registration.voxel_plane_icp import Frame
-
-
-class ScanToCubes(feature_map.ScanToMap):
-    """A scan against the points in the cubes around the sensor's own."""
-
-    def searched(self, placed: Float[Array, "k 3"], frame: Frame) -> Bool[Array, " k"]:
-        return matched_cubes(placed, frame, self.T_predicted.translation(), self.params)
 
 
 def matched_cubes(
-    placed: Float[Array, "k 3"], frame: Frame, position: Float[Array, "3"], params: Params
+    placed: Float[Array, "k 3"], frame: Frame, position: Float[Array, "3"], cubes: CubeGridParams
 ) -> Bool[Array, " k"]:
     """Return which points lie in the cubes around the sensor's own.
 
@@ -33,9 +25,8 @@ def matched_cubes(
         placed: m, in ``frame``.
         frame: near the sensor.
         position: of the sensor, m in world.
-        params: ``params.cubes``.
+        cubes: their edge, and how many are matched.
     """
-    cubes = params.cubes
     numbers = jnp.stack([cubes.matched_across, cubes.matched_across, cubes.matched_up])
     own = jnp.round(position / cubes.edge) * cubes.edge
     away = placed - (own - frame.origin).astype(placed.dtype)
@@ -43,7 +34,13 @@ def matched_cubes(
 
 
 def added_to(
-    cubes_map: FeatureMap, points: FeaturePoints, keep: Bool[Array, ""], frames: Frames, params: Params
+    cubes_map: FeatureMap,
+    points: FeaturePoints,
+    keep: Bool[Array, ""],
+    frames: Frames,
+    map_params: FeatureMapParams,
+    point_map: PointMapParams,
+    cubes: CubeGridParams,
 ) -> tuple[FeatureMap, Insertion, Insertion]:
     """Return the map with a scan's points, its grid shifted to the sensor; and what was added of either kind.
 
@@ -52,9 +49,10 @@ def added_to(
         points: each kind in its frame, m.
         keep: whether to add any.
         frames: near the sensor.
-        params: voxel sizes, ``params.cubes`` and ``params.point_map.nearer_by``.
+        map_params: for the voxel sizes.
+        point_map: for ``nearer_by``.
+        cubes: the grid.
     """
-    cubes = params.cubes
     half_sides = jnp.stack([cubes.across, cubes.across, cubes.up]) / 2 * cubes.edge
 
     def follow(pmap: PointMap, frame: Frame, block: Float[Array, ""]) -> PointMap:
@@ -62,4 +60,4 @@ def added_to(
         half = (half_sides / block).astype(jnp.float32)
         return shift_box(pmap, frame.anchor, half, cubes.margin.astype(jnp.float32) * cube, cube)
 
-    return feature_map.added_to(cubes_map, points, keep, frames, params, half_sides, follow)
+    return feature_map.added_to(cubes_map, points, keep, frames, map_params, point_map, half_sides, follow)

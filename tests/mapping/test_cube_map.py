@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lio_jax.mapping.cube_map import added_to, matched_cubes
+from lio_jax.mapping.feature_map import FeaturePoints, empty_feature_map, frames_at
 from lio_jax.mapping.point_map import EDGE
-from lio_jax.registration.cube_map import added_to, matched_cubes
-from lio_jax.registration.feature_map import empty_feature_map, frames_at
-from lio_jax.registration.lines_and_planes import FeaturePoints
 from lio_jax.settings.settings import recipe_settings, with_overrides
 from tests.mapping.test_point_map import held
 
@@ -28,9 +27,9 @@ def test_points_are_matched_in_the_five_by_five_by_three_cubes_around(position):
     rng = np.random.default_rng(0)
     where = np.array(position)
     points = where + rng.uniform(-220, 220, (5000, 3))
-    frame = frames_at(jnp.asarray(where), PARAMS).surface
+    frame = frames_at(jnp.asarray(where), PARAMS.map).surface
     placed = jnp.asarray(points - np.asarray(frame.origin), jnp.float32)
-    near = np.asarray(matched_cubes(placed, frame, jnp.asarray(where), PARAMS))
+    near = np.asarray(matched_cubes(placed, frame, jnp.asarray(where), PARAMS.cubes))
     apart = np.abs(cube_of(points) - cube_of(where))
     expected = (apart <= [2, 2, 1]).all(1)
     at_face = (np.abs((points + 25.0) / 50.0 - np.round((points + 25.0) / 50.0)) < 1e-5).any(1)
@@ -56,11 +55,11 @@ class Grid:
         self.points = self.points[inside]
 
 
-_add = jax.jit(partial(added_to, params=PARAMS))
+_add = jax.jit(partial(added_to, map_params=PARAMS.map, point_map=PARAMS.point_map, cubes=PARAMS.cubes))
 
 
 def added(cubes, points: np.ndarray, position: np.ndarray):
-    frames = frames_at(jnp.asarray(position), PARAMS)
+    frames = frames_at(jnp.asarray(position), PARAMS.map)
     mask = jnp.ones(len(points), bool)
     placed = FeaturePoints(
         jnp.asarray(points - np.asarray(frames.corner.origin), jnp.float32),
@@ -98,7 +97,7 @@ def test_the_grid_shifts_and_forgets_as_loams_does():
 
 def test_nothing_is_added_where_the_scan_was_lost():
     points = np.random.default_rng(2).uniform(-20, 20, (60, 3))
-    frames = frames_at(jnp.zeros(3), PARAMS)
+    frames = frames_at(jnp.zeros(3), PARAMS.map)
     mask = jnp.ones(60, bool)
     placed = FeaturePoints(jnp.asarray(points, jnp.float32), mask, jnp.asarray(points, jnp.float32), mask)
     cubes, corner, surface = _add(empty_feature_map(1024), placed, jnp.array(False), frames)
@@ -111,7 +110,7 @@ def test_sizes_of_the_grid_are_parameters():
     small = with_overrides(
         recipe_settings("loam"), ["params.cubes.edge=10", "params.cubes.matched_across=1"]
     ).params()
-    frame = frames_at(jnp.zeros(3), small).surface
+    frame = frames_at(jnp.zeros(3), small.map).surface
     placed = jnp.asarray([[4.0, 0, 0], [6.0, 0, 0], [0, 0, 14.0], [0, 0, 16.0]], jnp.float32)
-    near = matched_cubes(placed - jnp.asarray(frame.origin, jnp.float32), frame, jnp.zeros(3), small)
+    near = matched_cubes(placed - jnp.asarray(frame.origin, jnp.float32), frame, jnp.zeros(3), small.cubes)
     assert near.tolist() == [True, False, True, False]

@@ -1,0 +1,381 @@
+"""The stages of LIO-SAM's step: features, prediction, scan to map, smoother, keyframe.
+
+Each is a function of the state after the last scan and of what the stages before it found; the recipe
+:mod:`lio_jax.recipes.lio_sam` runs them in order.
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int32
+
+from lio_jax.core.status import LOST
+from lio_jax.core.types import ImuBatch, NavState, Scan, state_dtype
+from lio_jax.estimation.chain import information_of, linearise
+from lio_jax.estimation.sliding_window import Added, Window, append_and_update
+from lio_jax.estimation.smoother import Smoothed
+from lio_jax.imu.path import Path, deskew_along
+from lio_jax.imu.preintegration import preintegrate_parallel
+from lio_jax.imu.sampling import sample_intervals
+from lio_jax.imu.strapdown import path_along
+from lio_jax.lidar.features import (
+    FeatureCloud,
+    in_single_precision,
+    lio_sam_features,
+    thinned_features,
+)
+from lio_jax.mapping.feature_map import FeaturePoints, Frames
+from lio_jax.mapping.keyframes import is_due
+from lio_jax.mapping.point_map import Insertion
+from lio_jax.mapping.submap import Submap, with_scan
+from lio_jax.recipes import recipe
+from lio_jax.recipes.inertial_filter import lidar_pose
+from lio_jax.recipes.lio_sam_params import Config, Params
+from lio_jax.recipes.pose_limits import drawn_to_tilt, measured_attitude, within_limits
+from lio_jax.recipes.smoothed_odometry import match_as_measurement, opened, runs_away
+from lio_jax.registration.feature_match import ScanToSubmap
+from lio_jax.registration.gauss_newton import Registration, gauss_newton
+from lio_jax.registration.scan_match import FixedPoints
+
+_TIME_SLACK = 1e-3
+"""Sweeps do not end to the last bit in time, s."""
+
+
+class State(recipe.State):
+    """What is carried from scan to scan."""
+
+    nav: NavState
+    """At the last scan's end: the matched pose, velocity and biases of the smoother."""
+    window: Window
+    """The smoother's states, the latest at the last scan's end."""
+    time: Float[Array, ""]
+    """Since the first scan's end, s."""
+    matched_at: Float[Array, ""]
+    """The same of the last scan that was matched."""
+    scans: Int32[Array, ""]
+    """Scans with points seen so far."""
+    map: Submap
+
+    def with_velocity_of(self, found: "State") -> "State":
+        """Return this first state with the velocity of a later one."""
+        rows = self.window.states.velocity
+        velocity = found.nav.velocity
+
+        def places(state: Any) -> tuple[Any, ...]:
+            window = state.window
+            return state.nav.velocity, window.states.velocity, window.chain.prior.origin.velocity
+
+        return eqx.tree_at(
+            places, self, (velocity, jnp.broadcast_to(velocity[..., None, :], rows.shape), velocity)
+        )
+
+
+class Clock(eqx.Module):
+    """The times of a scan."""
+
+    first: Bool[Array, ""]
+    """No scan was seen before."""
+    end: Float[Array, ""]
+    """The scan's end, s from its start."""
+    interval: Float[Array, ""]
+    """From the last scan's end to this one's, s; 0 for the first."""
+    time: Float[Array, ""]
+    """The scan's end, s from the first scan's."""
+
+
+def clock_at(state: State, scan: Scan) -> Clock:
+    """Return the times of a scan after a state."""
+    first, dtype = state.scans == 0, state.nav.velocity.dtype
+    interval = jnp.where(first, 0.0, scan.interval.astype(dtype))
+    return Clock(first, scan.duration.astype(dtype), interval, state.time + interval)
+
+
+class Features(eqx.Module):
+    """A scan's thinned features, each at its own firing time."""
+
+    corner: FeatureCloud
+    surface: FeatureCloud
+    enough: Bool[Array, ""]
+    """There are as many corners and surface points as ``params.submap`` asks for."""
+    seen: Bool[Array, ""]
+    """The scan counts as one: it has points, and the first one has enough."""
+    dropped: Int32[Array, ""]
+    """Occupied cells beyond the capacities."""
+
+
+def picked_features(config: Config, params: Params, scan: Scan, first: Bool[Array, ""]) -> Features:
+    """Return the corners and surface points of a scan, thinned as the map is.
+
+    Args:
+        config: ``config.features`` and the capacities ``config.lio_sam``.
+        params: ``params.features``, the voxel sizes, and ``params.submap`` for the least numbers.
+        scan: padded sweep.
+        first: no scan was seen before.
+    """
+    features = in_single_precision(lio_sam_features, config, params, scan)
+    room = config.lio_sam.corner_points, config.lio_sam.surface_points
+    corner, surface, thinned_away = thinned_features(features.corner, features.surface, params, *room)
+    least = params.submap.min_corners, params.submap.min_surfaces
+    enough = (jnp.sum(corner.mask) >= least[0]) & (jnp.sum(surface.mask) >= least[1])
+    # a first scan that is too poor would be a map in which nothing is ever found
+    seen = jnp.where(first, enough, jnp.any(features.surface.mask))
+    return Features(corner, surface, enough, seen, thinned_away + features.dropped)
+
+
+class Prediction(eqx.Module):
+    """The motion that the samples foretell."""
+
+    T_world_imu: jaxlie.SE3
+    """The pose at the scan's end, where the scan match begins."""
+    velocity: Float[Array, "3"]
+    """The smoother's at the last scan's end, in world, m/s."""
+    path: Path
+    """From the last scan's end on, in the smoother's world."""
+
+
+def predict(state: State, clock: Clock, imu: ImuBatch) -> Prediction:
+    """Move the last matched pose by the increment of the smoother's state along the samples.
+
+    Args:
+        state: after the scan before.
+        clock: of the scan.
+        imu: samples around the time since then.
+    """
+    odometry = as_nav(state.nav, state.window)
+    # the first scan's end is the world's origin: its samples only deskew it
+    path = path_along(odometry, imu, jnp.where(clock.first, 0.0, clock.end - clock.interval), clock.end)
+    increment = odometry.T_world_imu.inverse() @ jaxlie.SE3(path.T_world_imu.wxyz_xyz[-1])
+    moved = state.nav.T_world_imu @ increment
+    guess = jnp.where(clock.first, state.nav.T_world_imu.wxyz_xyz, moved.wxyz_xyz)
+    return Prediction(jaxlie.SE3(guess), odometry.velocity, path)
+
+
+def compensated(features: Features, path: Path, T_imu_lidar: jaxlie.SE3) -> FeaturePoints:
+    """Return features as the sensor would have seen them from where it was at the scan's end."""
+    corner, surface = features.corner, features.surface
+    return FeaturePoints(
+        corner=deskew_along(path, T_imu_lidar, corner.points, corner.time),
+        corner_mask=corner.mask,
+        surface=deskew_along(path, T_imu_lidar, surface.points, surface.time),
+        surface_mask=surface.mask,
+    )
+
+
+class MapMatch(eqx.Module):
+    """What matching a scan with the keyframes around gave."""
+
+    registration: Registration
+    T_world_imu: jaxlie.SE3
+    """The matched pose, its tilt drawn to the inertial one; the prediction where the match is not used."""
+    used: Bool[Array, ""]
+    lost: Bool[Array, ""]
+    """The scan could not be matched although there was a map."""
+
+
+def scan_to_map(
+    config: Config,
+    params: Params,
+    state: State,
+    clock: Clock,
+    points: FeaturePoints,
+    prediction: Prediction,
+    imu: ImuBatch,
+    enough: Bool[Array, ""],
+) -> MapMatch:
+    """Match the features with the map, at most once in ``params.smoother.mapping_interval``.
+
+    Args:
+        config: ``config.knn`` and ``config.registration``.
+        params: traced.
+        state: after the scan before.
+        clock: of the scan.
+        points: compensated features, m, lidar frame of the scan's end.
+        prediction: where the match begins.
+        imu: samples, for the attitude that a nine-axis sensor reports.
+        enough: there are features enough to match.
+    """
+    guess, T_imu_lidar = prediction.T_world_imu, state.nav.T_imu_lidar
+    match = ScanToSubmap(
+        points_at=FixedPoints(points),
+        T_predicted=jaxlie.SE3((guess @ T_imu_lidar).wxyz_xyz),
+        registration=params.registration,
+        lidar=params.lidar,
+        map=state.map.features,
+        map_params=params.map,
+        knn=params.knn,
+        neighbours=config.knn.neighbours,
+    )
+    found = gauss_newton(match, config.registration.max_iterations)
+    due = clock.time - state.matched_at >= params.smoother.mapping_interval - _TIME_SLACK
+    lost = ((found.status == LOST) | ~enough) & ~clock.first
+    used = due & ~lost & ~clock.first
+    T_matched = within_limits(found.T_world_lidar, params.smoother) @ T_imu_lidar.inverse()
+    attitude, _ = measured_attitude(imu, clock.end + state.nav.time_offset, guess.rotation())
+    T_matched = drawn_to_tilt(T_matched, attitude, params.smoother.tilt_weight)
+    return MapMatch(found, jaxlie.SE3(jnp.where(used, T_matched.wxyz_xyz, guess.wxyz_xyz)), used, lost)
+
+
+class Smoothing(eqx.Module):
+    """What the smoother made of the scan match and the samples."""
+
+    window: Window
+    smoothed: Smoothed
+    """The smoother's result, of the window that is kept."""
+    T_world_imu: jaxlie.SE3
+    """The matched pose; after a failure the last one, carried on at the last velocity."""
+    failed: Bool[Array, ""]
+    """Velocity or biases ran away, and the window began anew."""
+
+
+def smooth(
+    config: Config,
+    params: Params,
+    state: State,
+    clock: Clock,
+    points: FeaturePoints,
+    prediction: Prediction,
+    imu: ImuBatch,
+    match: MapMatch,
+) -> Smoothing:
+    """Add the samples and the matched pose to the window, and begin anew where the result runs away.
+
+    Args:
+        config: ``config.lio_sam``.
+        params: ``params.imu``, ``params.smoother``, ``params.limits`` and what the window begins with.
+        state: after the scan before.
+        clock: of the scan.
+        points: compensated features: their distances scale the match's rotations.
+        prediction: by the samples.
+        imu: samples around the time since the last scan's end.
+        match: the scan's.
+    """
+    window, smoothed = _appended(config, params, state, clock, points, imu, match)
+    failed = runs_away(window.latest(), params) & ~clock.first
+    # neither the samples that led astray nor a match that began at their prediction
+    place = state.nav.T_world_imu.translation() + clock.interval * prediction.velocity
+    coasted = jaxlie.SE3.from_rotation_and_translation(prediction.T_world_imu.rotation(), place)
+    T_world_imu = jaxlie.SE3(jnp.where(failed, coasted.wxyz_xyz, match.T_world_imu.wxyz_xyz))
+    fresh = opened(config, params, _at_rest(state.nav, T_world_imu), params.smoother.degenerate_sigma)
+    window = jax.tree.map(
+        lambda old, new, anew: jnp.where(clock.first, old, jnp.where(failed, anew, new)),
+        state.window,
+        window,
+        fresh,
+    )
+    # of the window that is kept, whichever it is
+    normal = jax.lax.cond(
+        clock.first | failed,
+        lambda kept, _: linearise(kept.chain, information_of(kept.chain), kept.states),
+        lambda _, normal: normal,
+        window,
+        smoothed.normal,
+    )
+    smoothed = dataclasses.replace(smoothed, states=window.states, normal=normal)
+    return Smoothing(window, smoothed, T_world_imu, failed)
+
+
+def _appended(
+    config: Config,
+    params: Params,
+    state: State,
+    clock: Clock,
+    points: FeaturePoints,
+    imu: ImuBatch,
+    match: MapMatch,
+) -> tuple[Window, Smoothed]:
+    """Return the window with the state at the scan's end, smoothed; arguments as of :func:`smooth`."""
+    intervals = sample_intervals(imu, state.nav.time_offset, clock.end - clock.interval, clock.end)
+    latest = state.window.latest()
+    link = preintegrate_parallel(intervals, latest.gyro_bias, latest.accel_bias, params.imu)
+    measured = match_as_measurement(
+        config, params, match.T_world_imu, match.registration, _arm_squared(points), match.used
+    )
+    return append_and_update(
+        state.window,
+        Added(link, measured),
+        max_iterations=config.lio_sam.smoother_iterations,
+        tolerance=params.smoother.tolerance,
+    )
+
+
+class Addition(eqx.Module):
+    """The map after a scan, and what the scan added to it."""
+
+    submap: Submap
+    frames: Frames
+    placed: FeaturePoints
+    """The scan's features, each kind in its frame."""
+    corner: Insertion
+    """The scan's corners first, then those of a keyframe that the vehicle comes back to."""
+    surface: Insertion
+    """Likewise."""
+
+
+def keyframe(
+    params: Params,
+    state: State,
+    clock: Clock,
+    points: FeaturePoints,
+    nav: NavState,
+    features: Features,
+    match: MapMatch,
+    failed: Bool[Array, ""],
+) -> Addition:
+    """Make the scan a keyframe where its pose is sound and far enough from the last keyframe's.
+
+    Args:
+        params: ``params.submap``, ``params.point_map``, ``params.limits.outage`` and the voxel sizes.
+        state: after the scan before; its map is donated.
+        clock: of the scan.
+        points: compensated features, m, lidar frame of the scan's end.
+        nav: at the scan's end.
+        features: whether there are enough.
+        match: the scan's.
+        failed: the smoother ran away.
+    """
+    # the map is a constant of the derivative
+    T_world_lidar, still = jax.lax.stop_gradient((lidar_pose(nav), points))
+    away = clock.time - jnp.maximum(state.matched_at, 0.0) > params.limits.outage
+    # where the map does not reach, a new piece of it begins at the prediction
+    sound = (match.used | (match.lost & features.enough & away)) & ~failed
+    sound = sound | (clock.first & features.seen)
+    submap, frames, placed, added = with_scan(
+        state.map,
+        sound & is_due(state.map.keyframes, T_world_lidar, params.submap),
+        still,
+        T_world_lidar,
+        jax.lax.stop_gradient(clock.time),
+        params.map,
+        params.point_map,
+        params.submap,
+    )
+    return Addition(submap, frames, placed, *added)
+
+
+def as_nav(nav: NavState, window: Window) -> NavState:
+    """Return the navigation state with the latest of the window's."""
+    latest = window.latest()
+    return dataclasses.replace(
+        nav,
+        T_world_imu=jaxlie.SE3(latest.T_world_imu.wxyz_xyz),
+        velocity=latest.velocity,
+        gyro_bias=latest.gyro_bias,
+        accel_bias=latest.accel_bias,
+    )
+
+
+def _at_rest(nav: NavState, T_world_imu: jaxlie.SE3) -> NavState:
+    """Return what the smoother begins with after a failure: any velocity is as likely."""
+    zero = jnp.zeros_like(nav.velocity)
+    return dataclasses.replace(nav, T_world_imu=T_world_imu, velocity=zero, gyro_bias=zero, accel_bias=zero)
+
+
+def _arm_squared(points: FeaturePoints) -> Float[Array, ""]:
+    """Return the mean squared distance of a scan's features from the sensor, m^2."""
+    both, mask = points.together()
+    total = jnp.sum(jnp.where(mask[:, None], both, 0.0) ** 2)
+    return (total / jnp.maximum(jnp.sum(mask), 1)).astype(state_dtype())

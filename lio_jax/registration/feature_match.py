@@ -1,0 +1,116 @@
+"""Match corners with lines and surface points with planes (LOAM, LIO-SAM): in a map, its cubes or keyframes.
+
+Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014, sections V.C and VI.
+"""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int32
+
+from lio_jax.lidar.params import LidarParams
+from lio_jax.mapping.cube_map import matched_cubes
+from lio_jax.mapping.feature_map import FeatureMap, FeaturePoints, Frames, frames_at
+from lio_jax.mapping.frame import Frame
+from lio_jax.mapping.params import CubeGridParams, FeatureMapParams
+from lio_jax.registration.knn_planes import planes_near
+from lio_jax.registration.lines_and_planes import (
+    LinesAndPlanes,
+    Weights,
+    huber,
+    linearise,
+    lines_near,
+    no_lines_and_planes,
+    scored,
+)
+from lio_jax.registration.params import LineFitParams, RobustMatch, ScoredLineFitParams
+from lio_jax.registration.scan_match import NormalEquations, ScanMatch
+
+
+class FeatureMatch(ScanMatch[FeaturePoints, LinesAndPlanes]):
+    """A scan's corners and surface points against lines and planes."""
+
+    lidar: LidarParams
+
+    @abc.abstractmethod
+    def frames(self) -> Frames:
+        """Return the frames of the matches."""
+
+    def weights(self) -> Weights:
+        """Return the robust weights of distances: Huber's."""
+        assert isinstance(self.registration, RobustMatch)
+        return huber(self.registration.kernel)
+
+    def together(self, points: FeaturePoints) -> tuple[Float[Array, "k 3"], Bool[Array, " k"]]:
+        return points.together()
+
+    def unmatched(self) -> LinesAndPlanes:
+        return no_lines_and_planes(self.points_at(self.T_predicted))
+
+    def linearise(
+        self, T_world_lidar: jaxlie.SE3, found: LinesAndPlanes, iteration: Int32[Array, ""]
+    ) -> NormalEquations:
+        points, range_sigma = self.points_at(T_world_lidar), self.lidar.range_sigma
+        return linearise(found, points, T_world_lidar, self.frames(), self.weights(), range_sigma)
+
+
+class ScanToFeatures(FeatureMatch):
+    """A scan against a map of corners and surface points."""
+
+    map: FeatureMap
+    map_params: FeatureMapParams
+    knn: LineFitParams
+    neighbours: int = eqx.field(static=True)
+
+    def frames(self) -> Frames:
+        return frames_at(self.T_predicted.translation(), self.map_params)
+
+    def searched(self, placed: Float[Array, "k 3"], frame: Frame) -> Bool[Array, " k"]:
+        """Return which points, in m from the frame's origin, are matched at all."""
+        return jnp.ones(len(placed), bool)
+
+    def associate(self, points: FeaturePoints, T_world_lidar: jaxlie.SE3) -> LinesAndPlanes:
+        """Find lines and planes through the nearest map points."""
+        frames, sizes = self.frames(), self.map_params
+        _, corner = frames.corner.place(points.corner, T_world_lidar)
+        _, surface = frames.surface.place(points.surface, T_world_lidar)
+        return LinesAndPlanes(
+            lines_near(
+                self.map.corner,
+                corner,
+                points.corner_mask & self.searched(corner, frames.corner),
+                frames.corner.anchor,
+                sizes.corner_voxel_size,
+                self.knn,
+                self.neighbours,
+            ),
+            planes_near(
+                self.map.surface,
+                surface,
+                points.surface_mask & self.searched(surface, frames.surface),
+                frames.surface.anchor,
+                sizes.voxel_size,
+                self.knn,
+                self.neighbours,
+            ),
+        )
+
+
+class ScanToCubes(ScanToFeatures):
+    """A scan against the points in the cubes around the sensor's own (LOAM)."""
+
+    cubes: CubeGridParams
+
+    def searched(self, placed: Float[Array, "k 3"], frame: Frame) -> Bool[Array, " k"]:
+        return matched_cubes(placed, frame, self.T_predicted.translation(), self.cubes)
+
+
+class ScanToSubmap(ScanToFeatures):
+    """A scan against the points of keyframes, weighed by their scores (LIO-SAM)."""
+
+    knn: ScoredLineFitParams
+
+    def weights(self) -> Weights:
+        return scored(self.knn)

@@ -1,0 +1,119 @@
+"""A scan to be matched with a map: find what each point lies on, then linearise the distances at a pose.
+
+There are two ways to solve it: Gauss-Newton (:mod:`lio_jax.registration.gauss_newton`) and the iterated
+filter, to which a match is a measurement of the sensor's pose.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int32
+
+from lio_jax.registration.association import Association, associated, no_association
+from lio_jax.registration.params import RegistrationParams
+
+_Points = TypeVar("_Points")
+"""A scan's points, as a pytree of arrays."""
+_Found = TypeVar("_Found")
+"""What the points were associated with, as a pytree of arrays."""
+
+
+class NormalEquations(eqx.Module):
+    """The distances linearised at one pose, in world axes at the sensor's position."""
+
+    hessian: Float[Array, "6 6"]
+    gradient: Float[Array, "6"]
+    matches: Int32[Array, ""]
+    weight: Float[Array, ""]
+    """Sum of the robust weights."""
+    squared_error: Float[Array, ""]
+    """Robustly weighted sum of squared distances, m^2."""
+    arm_squared: Float[Array, ""]
+    """Mean squared distance of the points from the sensor, m^2: scales rotations to metres."""
+
+    @staticmethod
+    def nothing(dtype: jnp.dtype) -> "NormalEquations":
+        """Return the equations of no points."""
+        zero = jnp.zeros((), dtype)
+        return NormalEquations(jnp.zeros((6, 6), dtype), jnp.zeros(6, dtype), jnp.int32(0), zero, zero, zero)
+
+    def rmse(self) -> Float[Array, ""]:
+        """Return the robustly weighted root mean square distance to the map, m; 0 without matches."""
+        some = (self.weight > 0) & (self.squared_error > 0)
+        mean = jnp.where(some, self.squared_error, 1.0) / jnp.where(some, self.weight, 1.0)
+        return jnp.where(some, jnp.sqrt(mean), 0.0)
+
+
+class FixedPoints(eqx.Module, Generic[_Points]):
+    """Points whose motion compensation does not depend on the pose under trial."""
+
+    points: _Points
+
+    def __call__(self, T_world_lidar: jaxlie.SE3) -> _Points:
+        """Return the points, m, lidar frame."""
+        return self.points
+
+
+class ScanMatch(eqx.Module, Generic[_Points, _Found]):
+    """A scan and what it is matched with. Its arrays may be differentiated."""
+
+    points_at: Callable[[jaxlie.SE3], _Points]
+    """The motion-compensated points in the lidar frame, m, given the pose under trial. A pytree."""
+    T_predicted: jaxlie.SE3
+    """Where the solve begins, in the map's world."""
+    registration: RegistrationParams
+
+    @abc.abstractmethod
+    def together(self, points: _Points) -> tuple[Float[Array, "k 3"], Bool[Array, " k"]]:
+        """Return all points in one array, m, lidar frame, and which of them are real."""
+
+    @abc.abstractmethod
+    def unmatched(self) -> _Found:
+        """Return associations of none of the points."""
+
+    @abc.abstractmethod
+    def associate(self, points: _Points, T_world_lidar: jaxlie.SE3) -> _Found:
+        """Return what each point lies on at a pose.
+
+        Args:
+            points: as :attr:`points_at` returns them for this pose.
+            T_world_lidar: the pose under trial.
+        """
+
+    @abc.abstractmethod
+    def linearise(
+        self, T_world_lidar: jaxlie.SE3, found: _Found, iteration: Int32[Array, ""]
+    ) -> NormalEquations:
+        """Return the normal equations of the associated points at a pose.
+
+        Args:
+            T_world_lidar: the pose under trial.
+            found: what the points are associated with.
+            iteration: how many linearisations went before: a robust kernel may narrow with it.
+        """
+
+    def settled(self, iteration: Int32[Array, ""]) -> Bool[Array, ""]:
+        """Return whether the robust kernel has nearly its own width, so that the solve may end."""
+        return jnp.array(True)
+
+    def start(self) -> Association[_Found]:
+        """Return the association before the first search."""
+        return no_association(self.unmatched(), self.T_predicted)
+
+    def associated(self, last: Association[_Found], T_world_lidar: jaxlie.SE3) -> Association[_Found]:
+        """Return the last association where the scan is still near it, else a new one.
+
+        Near means that the points have moved less than ``registration.reassociation_distance``.
+        """
+        points = self.points_at(T_world_lidar)
+        return associated(
+            last,
+            lambda: self.associate(points, T_world_lidar),
+            *self.together(points),
+            T_world_lidar,
+            self.registration.reassociation_distance,
+        )
