@@ -265,7 +265,7 @@ def tune(
         data: Recordings to tune on.
         params: Parameters, such as imu.gyro_noise,imu.accel_noise or extrinsics.*.
         out: Folder for tuned.yaml, history.json and tuning.png; an earlier tuning there is gone on with.
-        objective: noise, pose, point, planes, marginal (lio_sam), map, ate, rpe, rpe-rotation, or a sum
+        objective: noise, pose, point, ranges, marginal (lio_sam), map, ate, rpe, rpe-rotation, or a sum
             such as ate+0.01*pose.
         recipe: Recipe or settings file to start from; None as for run.
         validate: Recordings that decide which iterate is taken and when to stop.

@@ -17,7 +17,7 @@ from lio_jax.run.scan_inputs import bucket_for
 from lio_jax.run.track import CompiledStep, track
 
 _OPENING = 3
-"""Scans in which every program of a drive has been compiled once: init, restart, step."""
+"""Scans in which every program of a drive has been compiled once: init and step."""
 
 
 class LioJaxSystem:

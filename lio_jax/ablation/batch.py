@@ -3,37 +3,20 @@
 import time
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from lio_jax.core.config import Config
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.settings import Settings
-from lio_jax.core.xla import PerShape
 from lio_jax.data.prefetch import prefetched
 from lio_jax.data.sequence import Sequence
-from lio_jax.recipes import recipe_named
+from lio_jax.recipes import recipe_of
+from lio_jax.recipes.transforms import batched
 from lio_jax.run.logs import Overflow, TrajectoryLog
 from lio_jax.run.run import check_start, failure_record, imu_feed, percentiles
-from lio_jax.run.track import ResultBuilder, ScanResult, run_steps, scan_inputs
-
-
-class BatchPrograms:
-    """A recipe's programs under one static config, for a batch of parameters."""
-
-    def __init__(self, recipe: str, config: Config) -> None:
-        self.recipe = recipe_named(recipe)(config)
-        self.init = PerShape(jax.jit(jax.vmap(self.recipe.init, (0, None))))
-        over_states = jax.vmap(self.recipe.step, (0, 0, None, None))
-        self.step = PerShape(jax.jit(over_states, donate_argnums=1))
-
-    @property
-    def compile_s(self) -> float:
-        """Return the time spent on compiling so far, s."""
-        return self.init.compile_s + self.step.compile_s
+from lio_jax.run.track import Compiled, ResultBuilder, ScanResult, run_steps, scan_inputs
 
 
 @dataclass(frozen=True)
@@ -55,7 +38,6 @@ def same_batch(settings: Settings) -> tuple[Any, ...]:
 def run_batch(
     sequence: Sequence,
     settings: Listing[Settings],
-    programs: BatchPrograms,
     start: int = 0,
     count: int | None = None,
 ) -> list[BatchedRun]:
@@ -64,7 +46,6 @@ def run_batch(
     Args:
         sequence: the recording, read once.
         settings: resolved, all alike in :func:`same_batch`.
-        programs: of their recipe and config.
         start: first scan.
         count: number of scans; None: to the end.
 
@@ -72,17 +53,18 @@ def run_batch(
         LioJaxError: no scan could be read.
     """
     check_start(sequence, start)
-    began, compiled_s = time.perf_counter(), programs.compile_s
+    began = time.perf_counter()
     first = settings[0]
     imu, imu_notes = imu_feed(sequence, first)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[one.params() for one in settings])
     runs = [_Run(one, start) for one in settings]
     scans: Any = prefetched(sequence.scans(start, count), first.config.data.prefetch)
-    compiled = programs.compile_s
-    for fed, state, output in run_steps(_BatchStep(programs, stacked), scan_inputs(first, scans, imu)):
+    stepper = Compiled(batched(recipe_of(first)), stacked)
+    compiled_s = stepper.compile_s
+    for fed, state, output in run_steps(stepper, scan_inputs(first, scans, imu)):
         nav, seen = jax.device_get((state.nav, output))
-        step_s = time.perf_counter() - fed.padded_at - (programs.compile_s - compiled)
-        compiled = programs.compile_s
+        step_s = time.perf_counter() - fed.padded_at - (stepper.compile_s - compiled_s)
+        compiled_s = stepper.compile_s
         for number, run in enumerate(runs):
             own_nav, own = jax.tree.map(lambda leaf, number=number: leaf[number], (nav, seen))
             run.add(run.judged(fed, own_nav, own.registration, own, step_s * 1e3 / len(runs)))
@@ -91,7 +73,7 @@ def run_batch(
         raise LioJaxError(f"{sequence.info.path}: no scan could be read. {reasons}".strip())
     shared = {
         "prediction": "inertial samples" if imu else "constant velocity",
-        "compile_s": round((programs.compile_s - compiled_s) / len(runs), 4),
+        "compile_s": round(stepper.compile_s / len(runs), 4),
         "wall_s": round((time.perf_counter() - began) / len(runs), 4),
     }
     warnings = [*sequence.warnings_so_far, *imu_notes, *(imu.warnings() if imu else ())]
@@ -127,17 +109,3 @@ class _Run:
 
     def warned(self, warnings: list[str]) -> dict[str, Any]:
         return {"warnings": [*warnings, *self._overflow.warnings()]}
-
-
-class _BatchStep:
-    """A :class:`lio_jax.run.track.Step` over a batch of states."""
-
-    def __init__(self, programs: BatchPrograms, params: Any) -> None:
-        self.initial_state = partial(programs.init, params)
-        self._step = partial(programs.step, params)
-
-    def restarted(self, state: Any, imu: Any) -> Any:
-        return self.initial_state(imu).with_velocity_of(state)
-
-    def __call__(self, state: Any, scan: Any, imu: Any) -> tuple[Any, Any]:
-        return self._step(state, scan, imu)

@@ -17,13 +17,12 @@ from lio_jax.core.files import atomic_path
 from lio_jax.core.settings import Settings
 from lio_jax.data.detect import open_sequence
 from lio_jax.run.run import settings_for
-from lio_jax.tuning.loss import Loss
+from lio_jax.tuning.gradient import Loss
 from lio_jax.tuning.objectives import Named, objective_named
 from lio_jax.tuning.optimise import Bounds
 from lio_jax.tuning.parameters import ParameterVector, free_parameters
 from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.session import HISTORY, Iterate, Session
-from lio_jax.tuning.values import StreamingValues
 
 Optimiser = Literal["auto", "scoring", "lbfgsb", "adam"]
 
@@ -68,7 +67,7 @@ def tune(
         optimiser = "scoring" if named.likelihood else "lbfgsb"
     if optimiser == "scoring" and not named.likelihood:
         raise UsageError(
-            "--optimizer scoring wants a likelihood (pose, point, planes, noise, marginal), "
+            "--optimizer scoring wants a likelihood (pose, point, ranges, noise, marginal), "
             f"not {options.objective}."
         )
     base = resolve_settings(options.recipe, options.assignments, options.params_from)
@@ -82,7 +81,6 @@ def tune(
         out,
         free,
         Loss(settings.recipe, settings.config, free, named.objective),
-        StreamingValues(settings.recipe, settings.config, free, named.objective),
         training,
         validation,
         named.likelihood,

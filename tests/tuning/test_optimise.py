@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.params import default_params
-from lio_jax.tuning.loss import Evaluated
+from lio_jax.tuning.gradient import Evaluated
 from lio_jax.tuning.optimise import Bounds, adam, fisher_information, fisher_scoring, lbfgsb
 from lio_jax.tuning.parameters import free_parameters
 from lio_jax.tuning.session import HISTORY, Session
