@@ -12,7 +12,7 @@ from lio_jax.run.track import CompiledStep, track
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
 from lio_jax.tuning.gradient import Loss, gradient
-from lio_jax.tuning.objectives import MeanOverScans, RelativeError, WeightedSum, objective_named
+from lio_jax.tuning.objectives import MeanOverScans, RelativeError, WeightedSum, pose_innovation
 from lio_jax.tuning.parameters import free_parameters
 from lio_jax.tuning.recording import Recording
 from tests.compilations import compilations
@@ -20,6 +20,7 @@ from tests.tuning.recordings import drive, settings
 
 FREE = ["imu.*_noise", "extrinsics.translation"]
 COUNT = 5
+POSE = MeanOverScans(pose_innovation)
 
 
 @cache
@@ -38,40 +39,39 @@ def other_drive() -> SimulatedSequence:
 
 
 def test_a_second_gradient_compiles_nothing():
-    first = gradient(drive(), FREE, "pose", chosen(), count=COUNT)
+    first = gradient(drive(), FREE, POSE, chosen(), count=COUNT)
     # simulating compiles, too
     read = Recording(other_drive(), chosen(), 0, COUNT)
     assert read.has_truth
     with compilations() as compiled:
-        again = gradient(drive(), FREE, "pose", chosen(), count=COUNT)
-        values = gradient(drive(), FREE, "pose", other_values(), count=COUNT)
-        recording = gradient(other_drive(), FREE, "pose", chosen(), count=COUNT)
+        again = gradient(drive(), FREE, POSE, chosen(), count=COUNT)
+        values = gradient(drive(), FREE, POSE, other_values(), count=COUNT)
+        recording = gradient(other_drive(), FREE, POSE, chosen(), count=COUNT)
     assert not compiled
     assert again == first
     assert len({first.value, values.value, recording.value}) == 3
 
 
 def test_other_parameters_and_objectives_have_programs_of_their_own():
-    gradient(drive(), FREE, "pose", chosen(), count=COUNT)
+    gradient(drive(), FREE, POSE, chosen(), count=COUNT)
     with compilations() as compiled:
         gradient(drive(), FREE, "map", chosen(), count=COUNT)
     # what adds a scan, and what makes a value of the sums; the steps are there
     assert len(compiled) == 2
     with compilations() as compiled:
-        gradient(drive(), ["imu.*_noise"], "pose", chosen(), count=COUNT)
+        gradient(drive(), ["imu.*_noise"], POSE, chosen(), count=COUNT)
     assert len(compiled) >= 4
 
 
 def test_a_second_evaluation_of_a_tuning_compiles_nothing():
     free = free_parameters(chosen().params(), FREE)
     elsewhere = free_parameters(other_values().params(), FREE)
-    objective = objective_named("pose").objective
     recording = Recording(drive(), chosen(), 0, COUNT)
     x = np.asarray(free.first())
-    loss = Loss("default", chosen().config, free, objective)
+    loss = Loss("default", chosen().config, free, POSE)
     before = loss(x, [recording]).value, loss.values(x[None], recording)[0]
     with compilations() as compiled:
-        loss = Loss("default", chosen().config, elsewhere, objective)
+        loss = Loss("default", chosen().config, elsewhere, POSE)
         after = loss(x + 0.1, [recording]).value, loss.values(x[None] + 0.1, recording)[0]
     assert not compiled
     assert before[0] != after[0]
