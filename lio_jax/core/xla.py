@@ -116,7 +116,10 @@ def programs(function: Callable[..., Any], *static: Any, donate: tuple[int, ...]
 
 
 def forget_programs() -> None:
-    """Free the memory of all programs that :func:`programs` keeps, those in use elsewhere included."""
+    """Drop all programs that :func:`programs` keeps, those in use elsewhere included.
+
+    JAX keeps them too, until ``jax.clear_caches()``.
+    """
     with _lock:
         for kept in _functions.values():
             kept.forget()

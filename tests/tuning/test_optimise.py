@@ -95,7 +95,7 @@ FREE = free_parameters(default_params(), ["imu.gyro_noise", "lidar.range_sigma"]
 
 def session(folder, loss=None, patience=50, observer=lambda iterate: None):
     evaluate = loss or (lambda x, recordings: noise_likelihood(x))
-    return Session(folder, FREE, evaluate, None, [None], [], True, patience, observer)
+    return Session(folder, FREE, evaluate, [None], [], True, patience, observer)
 
 
 def test_a_killed_tuning_goes_on_from_its_last_iterate(tmp_path):
