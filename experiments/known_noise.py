@@ -77,10 +77,9 @@ class Workshop:
         self, recipe: str, seconds: float, objective: str, world: str, surface: bool = False
     ) -> None:
         from lio_jax.settings.settings import with_overrides
-        from lio_jax.tuning.loss import Loss
+        from lio_jax.tuning.gradient import Loss
         from lio_jax.tuning.objectives import objective_named
         from lio_jax.tuning.parameters import free_parameters
-        from lio_jax.tuning.values import StreamingValues
 
         self.seconds = seconds
         self._recipe, tuning = recipe, TUNINGS[recipe]
@@ -89,9 +88,7 @@ class Workshop:
         start = with_overrides(self.settings, [f"params.{SURFACE}={RANGE_SIGMA}"] if surface else [])
         self.free = free_parameters(start.params(), (*tuning.free, SURFACE) if surface else tuning.free)
         named = objective_named(objective)
-        arguments = (self.settings.recipe, self.settings.config, self.free, named.objective)
-        self.loss, self.values = Loss(*arguments), StreamingValues(*arguments)
-        self._step: Any = None
+        self.loss = Loss(self.settings.recipe, self.settings.config, self.free, named.objective)
 
     def recording(self, world: str, seed: int) -> Any:
         """Return a simulated recording, which is ray cast once."""
@@ -137,7 +134,7 @@ class Workshop:
 
         recording, sequence = self.recording(world, seed)
         arrays, motion = sequence.truth_arrays(), sequence.truth()
-        self._step = step = self._step or CompiledStep(self.settings)
+        step = CompiledStep(self.settings)
         step.params = self.settings.params() if x is None else self.free(jnp.asarray(x))
         poses, truth, errors, covariances, nis = [], [], [], [], []
         anchor = None
@@ -182,7 +179,7 @@ class Workshop:
         course: list[tuple[int, float]] = []
 
         def value(x: np.ndarray) -> float:
-            loss = float(self.values(x[None], recording)[0])
+            loss = float(self.loss.values(x[None], recording)[0])
             best = min(loss, course[-1][1]) if course else loss
             course.append(((len(course) + 1) * len(recording), best))
             return loss

@@ -53,8 +53,8 @@ from .settings.settings import with_overrides as with_overrides
 from .sim.gps import GpsModel as GpsModel
 from .sim.imu import ImuModel as ImuModel
 from .sim.sequence import SimulatedSequence as SimulatedSequence
+from .tuning.gradient import Loss as Loss
 from .tuning.gradient import gradient as gradient
-from .tuning.loss import Loss as Loss
 from .tuning.objectives import MeanOverScans as MeanOverScans
 from .tuning.objectives import objective_named as objective_named
 from .tuning.optimise import Bounds as Bounds

@@ -12,6 +12,7 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
+from lio_jax.core import xla
 from tests import type_checker
 
 jax.config.update("jax_enable_x64", True)
@@ -65,5 +66,6 @@ def room_for_programs():
     mappings = _MAPPINGS.read_bytes().count(b"\n")
     resident = int(_MEMORY.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     if mappings > _MOST_MAPPINGS or resident > _MOST_MEMORY:
+        xla.forget_programs()
         jax.clear_caches()
         gc.collect()

@@ -50,11 +50,11 @@ def measured(scans: int) -> dict[str, float]:
     from lio_jax import ImuModel, SimulatedSequence
     from lio_jax.run.run import peak_rss_mb, settings_for
     from lio_jax.run.track import CompiledStep, run_steps
-    from lio_jax.settings.settings import recipe_settings
+    from lio_jax.settings.settings import recipe_of, recipe_settings
     from lio_jax.tuning.objectives import objective_named
     from lio_jax.tuning.parameters import free_parameters
     from lio_jax.tuning.recording import Recording
-    from lio_jax.tuning.streaming import StreamingGradient
+    from lio_jax.tuning.streaming import streaming_gradient
 
     class TimedRecording(Recording):
         """Record the time between the return of each scan and the request for the next one."""
@@ -70,8 +70,8 @@ def measured(scans: int) -> dict[str, float]:
     settings, _ = settings_for(sequence, recipe_settings("default"))
     recording = TimedRecording(sequence, settings, keep=False)
     free = free_parameters(settings.params(), PARAMETERS)
-    gradient = StreamingGradient(settings.recipe, settings.config, free, objective_named("pose").objective)
-    gradient(free.first(), recording)
+    pose = objective_named("pose").objective
+    streaming_gradient(recipe_of(settings), free, pose, free.first(), recording)
     gradient_ms = float(np.median(recording.ms[5:]))
     for _, state, output in run_steps(CompiledStep(settings), recording.scan_inputs()):
         jax.block_until_ready((state.nav, output))

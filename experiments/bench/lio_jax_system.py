@@ -17,7 +17,7 @@ from lio_jax.run.track import CompiledStep, track
 from lio_jax.settings.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 
 _OPENING = 3
-"""Number of scans in which every program of a drive is compiled: init, restart, step."""
+"""Scans in which every program of a drive has been compiled once: init and step."""
 
 
 class LioJaxSystem:

@@ -6,7 +6,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from lio_jax.ablation.batch import BatchPrograms, run_batch, same_batch
+from lio_jax.ablation.batch import run_batch, same_batch
 from lio_jax.ablation.results import write_result
 from lio_jax.ablation.sources import KeptSequence, Source
 from lio_jax.ablation.store import DiskError, Store
@@ -17,10 +17,8 @@ from lio_jax.data.config import DataConfig
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory, write_tum
 from lio_jax.evaluation.evaluate import evaluate
-from lio_jax.recipes.params import RecipeConfig as Config
 from lio_jax.run.folder import write_json, write_text
 from lio_jax.run.run import run_sequence, settings_for
-from lio_jax.run.track import CompiledStep, Programs
 from lio_jax.settings.settings import Settings
 
 _KEPT = {"trajectory.tum", "metrics.json", "config.yaml"}
@@ -75,16 +73,6 @@ def _batches(tasks: list[Task], sequence: Sequence) -> Iterator[list[Task]]:
         yield from (group[start : start + size] for start in range(0, len(group), size))
 
 
-@lru_cache(maxsize=8)
-def _programs(recipe: str, config: Config) -> Programs:
-    return Programs(recipe, config)
-
-
-@lru_cache(maxsize=8)
-def _batch_programs(recipe: str, config: Config) -> BatchPrograms:
-    return BatchPrograms(recipe, config)
-
-
 def _alone(
     task: Task, sequence: Sequence, truth: Trajectory | None, store: Store, whole_run: WholeRun | None
 ) -> None:
@@ -95,9 +83,7 @@ def _alone(
                 metrics = whole_run(sequence, task.settings, folder, task.source, truth)
             else:
                 settings = _without_pictures(settings)
-                step = CompiledStep(settings, _programs(settings.recipe, settings.config))
-                source = task.source
-                result = run_sequence(sequence, settings, folder, source.start, source.scans, step=step)
+                result = run_sequence(sequence, settings, folder, task.source.start, task.source.scans)
                 if result.interruption is not None:
                     raise result.interruption
                 metrics = _scored(result.metrics, result.trajectory, truth)
@@ -116,8 +102,7 @@ def _batched(tasks: list[Task], sequence: Sequence, truth: Trajectory | None, st
     source = tasks[0].source
     try:
         settings = [_without_pictures(settings_for(sequence, task.settings)[0]) for task in tasks]
-        programs = _batch_programs(settings[0].recipe, settings[0].config)
-        runs = run_batch(sequence, settings, programs, source.start, source.scans)
+        runs = run_batch(sequence, settings, source.start, source.scans)
     except Exception as error:
         for task in tasks:
             _fail(store, task, error)

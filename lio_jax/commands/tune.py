@@ -17,14 +17,13 @@ from lio_jax.core.files import atomic_path
 from lio_jax.data.detect import open_sequence
 from lio_jax.run.run import settings_for
 from lio_jax.settings.settings import Settings
-from lio_jax.tuning.loss import Loss
+from lio_jax.tuning.gradient import Loss
 from lio_jax.tuning.objective_names import LIKELIHOODS, SHORT
 from lio_jax.tuning.objectives import Named, objective_named
 from lio_jax.tuning.optimise import Bounds
 from lio_jax.tuning.parameters import ParameterVector, free_parameters
 from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.session import HISTORY, Iterate, Session
-from lio_jax.tuning.values import StreamingValues
 
 Optimiser = Literal["auto", "scoring", "lbfgsb", "adam"]
 
@@ -83,7 +82,6 @@ def tune(
         out,
         free,
         Loss(settings.recipe, settings.config, free, named.objective),
-        StreamingValues(settings.recipe, settings.config, free, named.objective),
         training,
         validation,
         named.likelihood,

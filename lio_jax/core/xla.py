@@ -1,7 +1,11 @@
-"""What this library asks of XLA: fast compilation of its programs, and intermediate results computed once."""
+"""How programs are compiled by XLA and kept, and how an intermediate result is not computed twice."""
 
 import gc
+import threading
 import time
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from functools import partial, update_wrapper
 from typing import Any, TypeVar
 
 import jax
@@ -53,7 +57,7 @@ def compiled(function: Any, *arguments: Any) -> jax.stages.Compiled:
 
 
 class PerShape:
-    """A jitted function that :func:`compiled` compiles once for each combination of shapes and dtypes."""
+    """A jitted function, compiled by :func:`compiled` once for every structure and shape of its arguments."""
 
     def __init__(self, jitted: Any) -> None:
         """Keep the function; nothing is compiled yet."""
@@ -67,10 +71,80 @@ class PerShape:
         return len(self._programs)
 
     def __call__(self, *arguments: Any) -> Any:
-        """Run the program for these arguments; compile it first where the shapes or dtypes are new."""
-        key = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(arguments))
-        if key not in self._programs:
+        """Run the program for these arguments."""
+        leaves, structure = jax.tree.flatten(arguments)
+        key = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+        program = self._programs.get(key)
+        if program is None:
             start = time.perf_counter()
-            self._programs[key] = compiled(self._jitted, *arguments)
+            program = self._programs[key] = compiled(self._jitted, *arguments)
             self.compile_s += time.perf_counter() - start
-        return self._programs[key](*arguments)
+        return program(*arguments)
+
+    def forget(self) -> None:
+        """Drop the programs; they are compiled anew when they are needed."""
+        self._programs.clear()
+
+
+_MOST_FUNCTIONS = 64
+"""A process has room for a limited number of programs: each takes several of its memory mappings."""
+_TRACED_BY = "jax_enable_x64", "jax_default_device"
+"""Settings of JAX under which the same arguments give another program."""
+_functions: OrderedDict[Hashable, PerShape] = OrderedDict()
+_lock = threading.Lock()
+
+
+def programs(function: Callable[..., Any], *static: Any, donate: tuple[int, ...] = ()) -> PerShape:
+    """Return the programs of a pure function, kept for the life of the process.
+
+    The same function with equal static arguments gives the same programs. The functions used longest ago are
+    forgotten first.
+
+    Args:
+        function: of a module or a class, not a closure or a lambda: a new one would have programs of its own.
+        static: its first arguments. None of them may change afterwards. One that can't be hashed equals only
+            itself.
+        donate: positions among the other arguments whose buffers the result may take.
+    """
+    setting = tuple(getattr(jax.config, name) for name in _TRACED_BY)
+    key = (function, *map(_comparable, static), donate, setting)
+    with _lock:
+        if key not in _functions:
+            bound = update_wrapper(partial(function, *static), function)
+            _functions[key] = PerShape(jax.jit(bound, donate_argnums=donate))
+        _functions.move_to_end(key)
+        while len(_functions) > _MOST_FUNCTIONS:
+            _functions.popitem(last=False)
+        return _functions[key]
+
+
+def forget_programs() -> None:
+    """Drop all programs that :func:`programs` keeps, those in use elsewhere included.
+
+    JAX keeps them too, until ``jax.clear_caches()``.
+    """
+    with _lock:
+        for kept in _functions.values():
+            kept.forget()
+        _functions.clear()
+
+
+class _Itself:
+    """Equals only another one of the same object."""
+
+    def __init__(self, held: Any) -> None:
+        self._held = held
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Itself) and self._held is other._held
+
+    def __hash__(self) -> int:
+        return id(self._held)
+
+
+def _comparable(static: Any) -> Hashable:
+    try:
+        hash(static)
+    except TypeError:
+        return _Itself(static)
+    return static

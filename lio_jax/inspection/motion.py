@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lio_jax.data.sequence import ImuData, LidarScan
-from lio_jax.run.track import CompiledStep, ScanResult, track
+from lio_jax.run.track import ScanResult, track
 from lio_jax.settings.settings import Settings
 
 THINNED_TO = 16384
@@ -72,12 +72,11 @@ def lidar_turns(windows: list[list[LidarScan]], settings: Settings) -> Turns:
     settings = settings.with_value("config.lidar.buckets", [THINNED_TO], "inspection")
     settings = settings.with_value("params.extrinsics.rotation", [0.0, 0.0, 0.0, 1.0], "inspection")
     settings = settings.with_value("params.extrinsics.translation", [0.0, 0.0, 0.0], "inspection")
-    step = CompiledStep(settings)
     starts, ends, rates = [], [], []
     for scans in windows:
         found = [
             (_middle_ns(scan), _attitude(tracked), bool(tracked.failure))
-            for scan, tracked in zip(scans, track(settings, scans, None, step), strict=True)
+            for scan, tracked in zip(scans, track(settings, scans), strict=True)
         ]
         # the velocity that compensates the first scan is known from the second one only
         for (start, before, lost), (end, after, also_lost) in pairwise(found[1:]):

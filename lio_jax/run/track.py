@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import numpy as np
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.types import ImuBatch, Scan
-from lio_jax.core.xla import PerShape
+from lio_jax.core.xla import programs
 from lio_jax.data.sequence import LidarScan
-from lio_jax.recipes import recipe_named
-from lio_jax.recipes.params import RecipeConfig as Config
+from lio_jax.recipes.opening import Stepper, reopened
 from lio_jax.recipes.params import RecipeParams as Params
+from lio_jax.recipes.transforms import RecipeLike
 from lio_jax.run.failures import Evidence, failure_of, longest_gap
 from lio_jax.run.scan_inputs import ImuFeed, bucket_for, padded
-from lio_jax.settings.settings import Settings
+from lio_jax.settings.settings import Settings, recipe_of
 
 
 @dataclass(frozen=True)
@@ -45,53 +45,50 @@ class ScanResult:
     """(k, 3) some of the points as recorded, m in the lidar frame of their own firing, for pictures."""
 
 
-class Programs:
-    """A recipe's programs under one static config, for any parameters and any recording."""
+class Compiled:
+    """The compiled functions of a recipe, or of a transformed one, at given parameters.
 
-    def __init__(self, recipe: str, config: Config) -> None:
-        self.recipe = recipe_named(recipe)(config)
-        self.init = PerShape(jax.jit(self.recipe.init))
-        self.step = PerShape(jax.jit(self.recipe.step, donate_argnums=1))
+    The programs are kept for the life of the process (:func:`lio_jax.core.xla.programs`): another one of an
+    equal recipe compiles nothing, whatever its parameters.
+    """
 
-    @property
-    def compile_s(self) -> float:
-        """Return the time spent on compiling so far, s."""
-        return self.init.compile_s + self.step.compile_s
-
-
-class CompiledStep:
-    """A recipe's step, compiled once per scan size, with the compile time kept apart from the run time."""
-
-    def __init__(self, settings: Settings, programs: Programs | None = None) -> None:
-        """Take the parameters.
+    def __init__(self, recipe: RecipeLike, params: Any) -> None:
+        """Look for the programs; those that are missing are compiled on first use.
 
         Args:
-            settings: recipe, config and params.
-            programs: of the same recipe and config, to reuse them; None: new ones.
+            recipe: hashable.
+            params: what its functions take first.
         """
-        self._programs = programs = programs or Programs(settings.recipe, settings.config)
-        self.config: Config = settings.config
-        self.params: Params = settings.params()
-        self.init_programs, self.step_programs = programs.init, programs.step
-        self._compiled_before_s = programs.compile_s
+        self.params = params
+        self.init_programs = programs(type(recipe).init, recipe)
+        self.step_programs = programs(type(recipe).step, recipe, donate=(1,))
+        self._compiled_before_s = self._compiled_s()
 
     @property
     def compile_s(self) -> float:
-        """Return the time spent on compiling since this step was made, s."""
-        return self._programs.compile_s - self._compiled_before_s
+        """Return the time spent on compiling since this was made, s."""
+        return self._compiled_s() - self._compiled_before_s
 
-    def initial_state(self, imu: Any) -> Any:
-        """Return the recipe's state before the first scan; ``imu``: samples up to its end, or None."""
+    def init(self, imu: ImuBatch | None) -> Any:
+        """Return the state before the first scan; ``imu``: samples up to its end, or None."""
         return self.init_programs(self.params, imu)
 
-    def restarted(self, state: Any, imu: Any) -> Any:
-        """Return the state before the first scan, with the velocity that ``state`` found."""
-        # no program of its own, which takes as long to compile as the first
-        return self.initial_state(imu).with_velocity_of(state)
-
-    def __call__(self, state: Any, scan: Any, imu: Any) -> tuple[Any, Any]:
-        """Run one step; ``state`` is consumed."""
+    def step(self, state: Any, scan: Scan, imu: ImuBatch | None) -> tuple[Any, Any]:
+        """Return state and output after a scan; ``state`` is consumed."""
         return self.step_programs(self.params, state, scan, imu)
+
+    def _compiled_s(self) -> float:
+        return self.init_programs.compile_s + self.step_programs.compile_s
+
+
+class CompiledStep(Compiled):
+    """The compiled functions of the recipe that settings name, at their parameters."""
+
+    params: Params
+
+    def __init__(self, settings: Settings) -> None:
+        """Look for the programs; those that are missing are compiled on first use."""
+        super().__init__(recipe_of(settings), settings.params())
 
 
 def track(
@@ -106,7 +103,7 @@ def track(
         settings: recipe, config and params.
         scans: in time order.
         imu: inertial samples; None where there are none or the recipe is to do without.
-        step: a compiled step of the same settings, to reuse its programs over several recordings.
+        step: of the same settings; None: a new one. It tells how long compiling took.
     """
     step = step or CompiledStep(settings)
     judged = ResultBuilder(settings)
@@ -191,48 +188,20 @@ def scan_inputs(settings: Settings, scans: Iterable[LidarScan], imu: ImuFeed | N
         last_end_ns, last_count = scan.end_ns, count
 
 
-class Step(Protocol):
-    """What takes an estimate from scan to scan; its state may be anything."""
-
-    def initial_state(self, imu: ImuBatch | None) -> Any:
-        """Return the state before the first scan; ``imu``: samples up to its end, or None."""
-        ...
-
-    def restarted(self, state: Any, imu: ImuBatch | None) -> Any:
-        """Return the state before the first scan, with the velocity that ``state`` found."""
-        ...
-
-    def __call__(self, state: Any, scan: Scan, imu: ImuBatch | None) -> tuple[Any, Any]:
-        """Return state and output after a scan; ``state`` is consumed."""
-        ...
-
-
-def run_steps(step: Step, scan_inputs: Iterable[ScanInput]) -> Iterator[tuple[ScanInput, Any, Any]]:
+def run_steps(stepper: Stepper, scan_inputs: Iterable[ScanInput]) -> Iterator[tuple[ScanInput, Any, Any]]:
     """Yield each scan with the state and the output after it; the state is consumed by the next one."""
     state: Any = None
     first: ScanInput | None = None
-    reopened = False
+    opened = False
     for fed in scan_inputs:
         if state is None or (fed.count and first is None):
-            state = step.initial_state(fed.before)
-        elif first is not None and fed.count and not reopened:
-            state, reopened = _reopened(step, state, first, fed), True
+            state = stepper.init(fed.before)
+        elif first is not None and fed.count and not opened:
+            state, opened = reopened(stepper, state, first, fed), True
         if fed.count and first is None:
             first = fed
-        state, output = step(state, fed.scan, fed.imu)
+        state, output = stepper.step(state, fed.scan, fed.imu)
         yield fed, state, output
-
-
-def _reopened(step: Step, state: Any, first: ScanInput, second: ScanInput) -> Any:
-    """Return the state after the first scan, compensated with the velocity that the second one shows.
-
-    Only the second scan tells how fast a vehicle is moving from the start; until then the map holds the first
-    scan distorted.
-    """
-    if first.scan.duration == 0 or first.scan.points.shape != second.scan.points.shape:
-        return state
-    trial, _ = step(state, second.scan, second.imu)
-    return step(step.restarted(trial, first.before), first.scan, first.imu)[0]
 
 
 _STRAGGLER = 0.25

@@ -1,16 +1,25 @@
-"""The gradient of a recording's objective in one line."""
+"""The gradient of a recording's objective in one line, and of the mean over several recordings."""
 
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass
+from typing import Literal
 
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.errors import UsageError
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory
+from lio_jax.recipes import recipe_named
+from lio_jax.recipes.params import RecipeConfig as Config
 from lio_jax.run.run import settings_for
-from lio_jax.settings.settings import Settings, recipe_settings
+from lio_jax.settings.settings import Settings, recipe_of, recipe_settings
 from lio_jax.tuning.objectives import Objective, objective_named
-from lio_jax.tuning.parameters import free_parameters
+from lio_jax.tuning.parameters import ParameterVector, free_parameters
 from lio_jax.tuning.recording import Recording
-from lio_jax.tuning.streaming import StreamingGradient
+from lio_jax.tuning.reverse import checkpointed_gradient
+from lio_jax.tuning.streaming import objective_values, streaming_gradient
 
 
 @dataclass(frozen=True)
@@ -32,8 +41,12 @@ def gradient(
     truth: Trajectory | None = None,
     start: int = 0,
     count: int | None = None,
+    mode: Literal["forward", "reverse"] = "forward",
 ) -> NamedGradient:
     """Return the objective of a recording and its gradient.
+
+    The first call compiles; others with the same recipe, config, parameters' names and objective do not, in
+    the same process.
 
     Args:
         sequence: the recording.
@@ -43,14 +56,60 @@ def gradient(
         truth: in place of the recording's own.
         start: first scan.
         count: number of scans; None: to the end.
+        mode: forward: constant memory, time grows with the number of parameters; reverse: time does not grow
+            with it, memory grows with the number of scans, all of which are kept.
 
     Raises:
-        UsageError: a parameter or an objective is not known, or can't be differentiated.
+        UsageError: a parameter, an objective or a mode is not known, or can't be differentiated.
     """
+    if mode not in ("forward", "reverse"):
+        raise UsageError(f"mode '{mode}' is not known; there are: forward, reverse.")
     resolved, _ = settings_for(sequence, settings or recipe_settings("default"))
     free = free_parameters(resolved.params(), list(patterns))
     chosen = objective_named(objective).objective if isinstance(objective, str) else objective
     recording = Recording(sequence, resolved, start, count, truth, keep=False)
-    result = StreamingGradient(resolved.recipe, resolved.config, free, chosen)(free.first(), recording)
+    differentiate = streaming_gradient if mode == "forward" else checkpointed_gradient
+    result = differentiate(recipe_of(resolved), free, chosen, free.first(), recording)
     by_name = dict(zip(free.names, result.gradient.tolist(), strict=True))
     return NamedGradient(result.value, by_name, result.unconverged)
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """The loss at one vector of parameters."""
+
+    value: float
+    gradient: NDArray[np.float64]
+    """(p,)."""
+    scores: NDArray[np.float64]
+    """(n, p) each scan's share of the gradient of the sum over all scans."""
+    unconverged: int
+    """Scans whose solve did not converge: with many of them the gradient is not to be trusted."""
+    scans: int
+
+
+class Loss:
+    """Mean objective over recordings, weighted by their numbers of scans."""
+
+    def __init__(self, recipe: str, config: Config, free: ParameterVector, objective: Objective) -> None:
+        """Keep what the loss is of."""
+        self._loss_of = recipe_named(recipe)(config), free, objective
+
+    def __call__(self, x: NDArray[np.float64], recordings: Listing[Recording]) -> Evaluated:
+        """Return the loss at a vector of parameters, with its gradient."""
+        results = [streaming_gradient(*self._loss_of, jnp.asarray(x), recording) for recording in recordings]
+        counts = np.array([len(result.scores) for result in results])
+        shares = counts / counts.sum()
+        return Evaluated(
+            value=float(shares @ [result.value for result in results]),
+            gradient=shares @ np.stack([result.gradient for result in results]),
+            scores=np.concatenate(
+                [count * result.scores for count, result in zip(counts, results, strict=True)]
+            ),
+            unconverged=sum(len(result.unconverged) for result in results),
+            scans=int(counts.sum()),
+        )
+
+    def values(self, xs: NDArray[np.float64], recording: Recording) -> NDArray[np.float64]:
+        """Return the objective of one recording at each row of ``xs``, without gradients."""
+        return objective_values(*self._loss_of, jnp.asarray(xs), recording)

@@ -11,11 +11,12 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.types import NavState, Scan, state_dtype
+from lio_jax.core.types import ImuBatch, NavState, Scan, state_dtype
 from lio_jax.lidar.params import BeamParams
 from lio_jax.lidar.range_scatter import range_scatter
 from lio_jax.recipes.output import Evidence
 from lio_jax.recipes.params import RecipeParams as Params
+from lio_jax.recipes.transforms import RecipeLike
 from lio_jax.registration.point_evidence import PointEvidence
 from lio_jax.tuning.objective_names import EXAMPLE, LISTED, SHORT
 
@@ -71,8 +72,30 @@ class Observed(eqx.Module):
         return replace(self, scan=scan, params=params)
 
 
+@dataclass(frozen=True)
+class Observing:
+    """A recipe whose output is what an objective sees: nothing else is computed or differentiated."""
+
+    recipe: RecipeLike
+
+    def init(self, params: Params, imu: ImuBatch | None = None) -> Any:
+        """Return the state before the first scan."""
+        return self.recipe.init(params, imu)
+
+    def step(
+        self, params: Params, state: Any, scan: Scan, imu: ImuBatch | None = None
+    ) -> tuple[Any, Observed]:
+        """Return the state after a scan and what the step leaves to see."""
+        state, output = self.recipe.step(params, state, scan, imu)
+        return state, Observed.of(state, output)
+
+
 class Objective(Protocol):
-    """A loss over a recording: lower is better. Its sums are a pytree of floating-point arrays."""
+    """A loss over a recording: lower is better. Its sums are a pytree of floating-point arrays.
+
+    Compiled programs are kept by what it is, so it must not change after its first use: let it be an
+    ``equinox.Module``, or a frozen dataclass.
+    """
 
     def start(self) -> Any:
         """Return the sums before the first scan."""

@@ -5,6 +5,7 @@ from functools import partial
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from lio_jax.core.errors import UsageError
 from lio_jax.core.leaf import Tuned, settings_of
 from lio_jax.recipes.params import RecipeParams
+from lio_jax.recipes.transforms import Dual
 
 
 class ParameterVector(eqx.Module):
@@ -45,6 +47,20 @@ class ParameterVector(eqx.Module):
             params = eqx.tree_at(partial(_leaf, path=path), params, value)
             used += size
         return params
+
+    def split(self, params: RecipeParams) -> tuple[RecipeParams, RecipeParams]:
+        """Return the leaves that are tuned, and the others, each with None in place of the rest."""
+        none = jax.tree.map(lambda _: False, self.start)
+        tuned = eqx.tree_at(
+            lambda tree: [_leaf(tree, path) for path in self.paths], none, [True] * len(self.paths)
+        )
+        return eqx.partition(params, tuned)
+
+    def with_tangents(self, x: Float[Array, " p"]) -> Dual:
+        """Return the parameters of a vector and their derivatives by it."""
+        directions = jnp.eye(len(x), dtype=x.dtype)
+        dot = jax.vmap(lambda direction: jax.jvp(lambda x: self.split(self(x))[0], (x,), (direction,))[1])
+        return Dual(self(x), dot(directions))
 
     def overrides(self, x: NDArray[np.float64]) -> dict[str, Any]:
         """Return the tuned leaves as plain numbers by their settings path, ``params.imu.gyro_noise``."""

@@ -7,8 +7,7 @@ the number of checkpoints, not with the steps.
 
 import math
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,155 +17,236 @@ from jaxtyping import Array
 from numpy.typing import NDArray
 
 from lio_jax.core.types import ImuBatch, Scan
-from lio_jax.core.xla import PerShape
-from lio_jax.recipes import recipe_named
-from lio_jax.recipes.params import RecipeConfig as Config
+from lio_jax.core.xla import programs
+from lio_jax.recipes.params import RecipeParams as Params
+from lio_jax.recipes.transforms import RecipeLike, split_smooth
 from lio_jax.run.track import run_steps
-from lio_jax.tuning.objectives import Objective, Observed, TruePose
+from lio_jax.tuning.objectives import Objective, Observed, Observing, TruePose
 from lio_jax.tuning.parameters import ParameterVector
 from lio_jax.tuning.recording import Recording
-from lio_jax.tuning.streaming import split_smooth
+from lio_jax.tuning.streaming import add_scan, not_converged, split_objective, value_of
 
-_KINDS = ("init", "restart", "step")
-_SHORTEST = 8
-"""Steps between checkpoints at least: the opening, which tries the second scan first, must not be cut."""
+
+class TotalGradient(NamedTuple):
+    """An objective over a recording and its derivative."""
+
+    value: float
+    gradient: NDArray[np.float64]
+    """(p,) by the vector of :class:`ParameterVector`."""
+    unconverged: tuple[int, ...]
+    """Scans whose solve did not converge: the derivative is not to be trusted."""
+
+
+def checkpointed_gradient(
+    recipe: RecipeLike,
+    free: ParameterVector,
+    objective: Objective,
+    x: Array,
+    recording: Recording,
+    every: int | None = None,
+) -> TotalGradient:
+    """Return an objective and its gradient by reverse mode.
+
+    Args:
+        recipe: hashable.
+        free: the parameters by which to differentiate.
+        objective: of the whole recording.
+        x: (p,) where.
+        recording: run through once; its scans are kept until the way back.
+        every: steps between checkpoints; None: the square root of their number.
+    """
+    every = every or max(1, math.isqrt(len(recording)))
+    tape = _Tape(Observing(recipe), free.split(programs(ParameterVector.__call__)(free, x)), objective, every)
+    unconverged = []
+    for fed, state, seen in run_steps(tape, recording.scan_inputs()):
+        tape.count(state, seen, fed.scan, recording.truth_at(fed.end_ns))
+        if not_converged(seen):
+            unconverged.append(fed.index)
+    value, params_bar = tape.unwound()
+    x_bar = programs(_pull_params)(free, x, params_bar)
+    return TotalGradient(value, np.asarray(x_bar), tuple(unconverged))
 
 
 @dataclass
 class _Operation:
-    """One entry of the tape: from the state numbered ``source`` to the state of its own number."""
+    """One entry of the tape; its number is its place there, and that of the state it gave."""
 
-    kind: str
-    source: int
-    scan: Scan | None
-    imu: ImuBatch | None
-    sums: Any
+    sources: tuple[int, ...]
+    """Numbers of the states it was given: none for a first state, two for a velocity handed over."""
+    scan: Scan | None = None
+    imu: ImuBatch | None = None
+    sums: Any = None
     """The objective's sums before."""
     truth: TruePose | None = None
     """Set where the result entered the objective."""
 
 
 @dataclass
-class _Numbered:
+class _Taped:
     """A state and its place on the tape."""
 
+    tape: "_Tape"
     number: int
     state: Any
 
-
-class CheckpointedGradient:
-    """Programs for one recipe, one set of free parameters and one objective; compiled on first use."""
-
-    def __init__(self, recipe: str, config: Config, free: ParameterVector, objective: Objective) -> None:
-        """Keep what shapes the programs."""
-        module = recipe_named(recipe)(config)
-        self.objective = objective
-
-        def forward(kind: str, x: Array, state: Any, scan: Any, imu: Any) -> tuple[Any, Observed | None]:
-            if kind == "init":
-                return module.init(free(x), imu), None
-            if kind == "restart":
-                return module.init(free(x), imu).with_velocity_of(state), None
-            state, output = module.step(free(x), state, scan, imu)
-            return state, Observed.of(state, output)
-
-        def add(x: Array, sums: Any, seen: Observed, scan: Scan, truth: TruePose) -> Any:
-            return objective.add(sums, seen.beside(scan, free(x)), truth)
-
-        def backward(
-            kind: str, x: Array, state: Any, sums: Any, scan: Any, imu: Any, truth: Any, cotangent: Any
-        ) -> tuple[Array, Any, Any]:
-            smooth, fixed = (None, None) if state is None else split_smooth(state)
-
-            def smooth_part(x: Array, smooth: Any, sums: Any) -> tuple[Any, Any]:
-                old = None if state is None else eqx.combine(smooth, fixed)
-                new, seen = forward(kind, x, old, scan, imu)
-                if seen is not None and truth is not None:
-                    sums = add(x, sums, seen, scan, truth)
-                return split_smooth(new)[0], sums
-
-            _, pull = jax.vjp(smooth_part, x, smooth, sums)
-            return pull(cotangent)
-
-        self.forward = {kind: PerShape(jax.jit(partial(forward, kind))) for kind in _KINDS}
-        self.backward = {kind: PerShape(jax.jit(partial(backward, kind))) for kind in _KINDS}
-        self.add = PerShape(jax.jit(add))
-        self.value = PerShape(jax.jit(jax.value_and_grad(objective.value)))
-
-    def __call__(
-        self, x: NDArray[np.float64] | Array, recording: Recording, every: int | None = None
-    ) -> tuple[float, NDArray[np.float64]]:
-        """Return the objective and its gradient at a vector of parameters.
-
-        Args:
-            x: (p,).
-            recording: run through once; its scans are kept until the way back.
-            every: steps between checkpoints, at least 8; None: the square root of their number.
-        """
-        tape = _Tape(self, jnp.asarray(x), max(every or math.isqrt(len(recording)), _SHORTEST))
-        for fed, state, seen in run_steps(tape, recording.scan_inputs()):
-            tape.count(state, seen, fed.scan, recording.truth_at(fed.end_ns))
-        return tape.unwound()
+    def with_velocity_of(self, found: "_Taped") -> "_Taped":
+        """Return this first state with the velocity that a later state found."""
+        return self.tape.handed_over(self, found)
 
 
 class _Tape:
-    """A :class:`lio_jax.run.track.Step` that remembers what it did."""
+    """A :class:`lio_jax.recipes.opening.Stepper` that remembers what it did."""
 
-    def __init__(self, programs: CheckpointedGradient, x: Array, every: int) -> None:
-        self._programs, self._x, self._every = programs, x, every
+    def __init__(
+        self, recipe: RecipeLike, params: tuple[Params, Params], objective: Objective, every: int
+    ) -> None:
+        """Begin a tape.
+
+        Args:
+            recipe: its output is what the objective sees.
+            params: the leaves that are tuned, and the others.
+            objective: of the whole recording.
+            every: steps between checkpoints.
+        """
+        self._params, self._every = params, every
+        self._arrays, static = split_objective(objective)
+        # unlike a run's, these don't consume the state, which may be a checkpoint
+        self._init = programs(type(recipe).init, recipe)
+        self._step = programs(type(recipe).step, recipe)
+        self._add = programs(add_scan, static)
+        self._value = programs(_value_and_slopes, static)
+        self._pull_init = programs(_pull_init, recipe)
+        self._pull_step = programs(_pull_step, recipe, static)
         self._operations: list[_Operation] = []
         self._kept: dict[int, Any] = {}
-        self._sums = programs.objective.start()
+        self._sums = objective.start()
 
-    def initial_state(self, imu: ImuBatch | None) -> _Numbered:
-        return self._done("init", None, None, imu)[0]
+    def init(self, imu: ImuBatch | None) -> _Taped:
+        """Return the state before the first scan; ``imu``: samples up to its end, or None."""
+        return self._noted(_Operation((), imu=imu), ())[0]
 
-    def restarted(self, state: _Numbered, imu: ImuBatch | None) -> _Numbered:
-        return self._done("restart", state, None, imu)[0]
-
-    def __call__(self, state: _Numbered, scan: Scan, imu: ImuBatch | None) -> tuple[_Numbered, Any]:
-        return self._done("step", state, scan, imu)
-
-    def _done(
-        self, kind: str, old: _Numbered | None, scan: Scan | None, imu: ImuBatch | None
-    ) -> tuple[_Numbered, Any]:
+    def step(self, state: _Taped, scan: Scan, imu: ImuBatch | None) -> tuple[_Taped, Observed]:
+        """Return the state after a scan and what it leaves to see."""
         number = len(self._operations)
-        state, seen = self._programs.forward[kind](self._x, old and old.state, scan, imu)
-        self._operations.append(_Operation(kind, old.number if old else -1, scan, imu, self._sums))
-        if number % self._every == 0:
-            self._kept[number] = old and old.state
-        return _Numbered(number, state), seen
+        # what comes after a step needs no state before it
+        if number - max(self._kept) >= self._every:
+            self._kept[number] = state.state
+        return self._noted(_Operation((state.number,), scan, imu, self._sums), (state.state,))
 
-    def count(self, state: _Numbered, seen: Observed, scan: Scan, truth: TruePose) -> None:
+    def handed_over(self, first: _Taped, found: _Taped) -> _Taped:
+        """Return a first state with the velocity that a later state found."""
+        return self._noted(_Operation((first.number, found.number)), (first.state, found.state))[0]
+
+    def count(self, state: _Taped, seen: Observed, scan: Scan, truth: TruePose) -> None:
         """Add the last step to the objective."""
         self._operations[state.number].truth = truth
-        self._sums = self._programs.add(self._x, self._sums, seen, scan, truth)
+        self._sums = self._add(self._arrays, eqx.combine(*self._params), self._sums, seen, scan, truth)
 
-    def unwound(self) -> tuple[float, NDArray[np.float64]]:
-        """Return the objective and its gradient, from the tape's end to its start."""
-        value, sums_bar = self._programs.value(self._sums)
-        x_bar = jnp.zeros_like(self._x)
-        state_bar: dict[int, Any] = {}
+    def unwound(self) -> tuple[float, Params]:
+        """Return the objective and its derivative by the tuned leaves, from the tape's end to its start."""
+        value, sums_bar = self._value(self._arrays, self._sums)
+        params_bar = jax.tree.map(jnp.zeros_like, self._params[0])
+        bars: dict[int, Any] = {}
+        end = len(self._operations)
         for start in sorted(self._kept, reverse=True):
-            segment = range(start, min(start + self._every, len(self._operations)))
-            states = {self._operations[start].source: self._kept.pop(start)}
-            for number in segment:
-                one = self._operations[number]
-                states[number], _ = self._programs.forward[one.kind](
-                    self._x, states[one.source], one.scan, one.imu
-                )
-            for number in reversed(segment):
-                one = self._operations[number]
-                bar = state_bar.pop(number, None)
+            segment = self._operations[start:end]
+            states = dict.fromkeys(segment[0].sources, self._kept[start])
+            for number, one in enumerate(segment, start):
+                states[number], _ = self._done(one, tuple(states[source] for source in one.sources))
+            for number, one in reversed(list(enumerate(segment, start))):
+                bar = bars.pop(number, None)
                 if bar is None:
                     bar = jax.tree.map(jnp.zeros_like, split_smooth(states[number])[0])
-                fed = (one.sums, one.scan, one.imu, one.truth)
-                own_bar, source_bar, sums_bar = self._programs.backward[one.kind](
-                    self._x, states[one.source], *fed, (bar, sums_bar)
-                )
-                x_bar += own_bar
-                if one.source >= 0:
-                    before = state_bar.get(one.source)
-                    both = source_bar if before is None else jax.tree.map(jnp.add, before, source_bar)
-                    state_bar[one.source] = both
-        return float(value), np.asarray(x_bar)
+                given = tuple(states[source] for source in one.sources)
+                own, sources, sums_bar = self._pulled(one, given, bar, sums_bar)
+                params_bar = jax.tree.map(jnp.add, params_bar, own)
+                for source, more in zip(one.sources, sources, strict=True):
+                    before = bars.get(source)
+                    bars[source] = more if before is None else jax.tree.map(jnp.add, before, more)
+            end = start
+            del self._kept[start]
+        return float(value), params_bar
+
+    def _noted(self, operation: _Operation, given: tuple[Any, ...]) -> tuple[_Taped, Any]:
+        number = len(self._operations)
+        if not self._kept:
+            self._kept[number] = None
+        self._operations.append(operation)
+        state, seen = self._done(operation, given)
+        return _Taped(self, number, state), seen
+
+    def _done(self, operation: _Operation, given: tuple[Any, ...]) -> tuple[Any, Observed | None]:
+        """Return the state that an operation gives, and what it leaves to see."""
+        params = eqx.combine(*self._params)
+        if operation.scan is not None:
+            return self._step(params, *given, operation.scan, operation.imu)
+        if given:
+            first, found = given
+            return first.with_velocity_of(found), None
+        return self._init(params, operation.imu), None
+
+    def _pulled(
+        self, operation: _Operation, given: tuple[Any, ...], bar: Any, sums_bar: Any
+    ) -> tuple[Params, tuple[Any, ...], Any]:
+        """Return the derivatives by params, by the states given and by the sums before an operation."""
+        if operation.scan is not None:
+            fed = operation.sums, operation.scan, operation.imu, operation.truth
+            own, before, sums_bar = self._pull_step(self._arrays, self._params, *given, *fed, bar, sums_bar)
+            return own, (before,), sums_bar
+        if given:
+            first, found = given
+            none = jax.tree.map(jnp.zeros_like, self._params[0])
+            return none, _pull_velocity(first, found, bar), sums_bar
+        return self._pull_init(self._params, operation.imu, bar), (), sums_bar
+
+
+def _pull_params(free: ParameterVector, x: Array, bar: Params) -> Array:
+    return jax.vjp(lambda x: free.split(free(x))[0], x)[1](bar)[0]
+
+
+def _pull_init(recipe: RecipeLike, params: tuple[Params, Params], imu: ImuBatch | None, bar: Any) -> Params:
+    tuned, others = params
+
+    def init(tuned: Params) -> Any:
+        return split_smooth(recipe.init(eqx.combine(tuned, others), imu))[0]
+
+    return jax.vjp(init, tuned)[1](bar)[0]
+
+
+def _pull_step(
+    recipe: RecipeLike,
+    static: Any,
+    arrays: Any,
+    params: tuple[Params, Params],
+    state: Any,
+    sums: Any,
+    scan: Scan,
+    imu: ImuBatch | None,
+    truth: TruePose | None,
+    bar: Any,
+    sums_bar: Any,
+) -> tuple[Params, Any, Any]:
+    (tuned, others), (smooth, fixed) = params, split_smooth(state)
+
+    def step(tuned: Params, smooth: Any, sums: Any) -> tuple[Any, Any]:
+        whole = eqx.combine(tuned, others)
+        new, seen = recipe.step(whole, eqx.combine(smooth, fixed), scan, imu)
+        if truth is not None:
+            sums = add_scan(static, arrays, whole, sums, seen, scan, truth)
+        return split_smooth(new)[0], sums
+
+    return jax.vjp(step, tuned, smooth, sums)[1]((bar, sums_bar))
+
+
+def _pull_velocity(first: Any, found: Any, bar: Any) -> tuple[Any, Any]:
+    halves = split_smooth(first), split_smooth(found)
+
+    def hand_over(*smooth: Any) -> Any:
+        whole = [eqx.combine(own, rest) for own, (_, rest) in zip(smooth, halves, strict=True)]
+        return split_smooth(whole[0].with_velocity_of(whole[1]))[0]
+
+    return jax.vjp(hand_over, *(smooth for smooth, _ in halves))[1](bar)
+
+
+def _value_and_slopes(static: Any, arrays: Any, sums: Any) -> tuple[Array, Any]:
+    return jax.value_and_grad(lambda sums: value_of(static, arrays, sums))(sums)

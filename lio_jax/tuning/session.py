@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import atomic_path
-from lio_jax.tuning.loss import Evaluated, Loss
+from lio_jax.tuning.gradient import Evaluated, Loss
 from lio_jax.tuning.optimise import Bounds, adam, fisher_information, fisher_scoring, lbfgsb
 from lio_jax.tuning.parameters import ParameterVector
 from lio_jax.tuning.recording import Recording
-from lio_jax.tuning.values import StreamingValues
 
 HISTORY = "history.json"
 
@@ -58,7 +57,6 @@ class Session:
         folder: Path,
         free: ParameterVector,
         loss: Loss,
-        values: StreamingValues,
         training: Listing[Recording],
         validation: Listing[Recording],
         likelihood: bool,
@@ -71,7 +69,6 @@ class Session:
             folder: gets ``history.json`` after every evaluation.
             free: parameters that are tuned.
             loss: their loss.
-            values: the same objective without gradient, for validation.
             training: recordings to tune on.
             validation: recordings to judge by; may be empty.
             likelihood: the loss is a mean negative log-likelihood.
@@ -82,7 +79,7 @@ class Session:
             LioJaxError: the history is that of other parameters.
         """
         self._path = folder / HISTORY
-        self._free, self._loss, self._values = free, loss, values
+        self._free, self._loss = free, loss
         self._training, self._validation = training, validation
         self._likelihood, self._patience, self._observer = likelihood, patience, observer
         self.history: list[Iterate] = _read(self._path, free) if self._path.exists() else []
@@ -136,7 +133,7 @@ class Session:
         validation = None
         if self._validation:
             rows = np.asarray(x)[None]
-            losses = [float(self._values(rows, recording)[0]) for recording in self._validation]
+            losses = [float(self._loss.values(rows, recording)[0]) for recording in self._validation]
             validation = float(np.average(losses, weights=[len(recording) for recording in self._validation]))
         iterate = Iterate(
             tuple(np.asarray(x).tolist()),

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from lio_jax.ablation import perform as performing
-from lio_jax.ablation.batch import BatchPrograms, run_batch
+from lio_jax.ablation.batch import run_batch
 from lio_jax.ablation.perform import perform
 from lio_jax.ablation.results import gathered
 from lio_jax.ablation.spec import METRICS, load_spec
@@ -17,7 +17,7 @@ from lio_jax.ablation.tasks import tasks_of
 from lio_jax.commands.runtime import prepare_jax
 from lio_jax.core.errors import LioJaxError
 from lio_jax.run.run import imu_feed, settings_for
-from lio_jax.run.track import CompiledStep, Programs, scan_inputs, track
+from lio_jax.run.track import scan_inputs, track
 from tests.ablation.drives import DRIVE, SMALL, write_spec
 from tests.full_disk import full_disk_after
 
@@ -67,12 +67,11 @@ def test_a_batch_equals_the_runs_one_by_one(tmp_path, monkeypatch):
     )
     sequence = tasks[0].source.open(tasks[0].settings.run.data)
     settings = [settings_for(sequence, one.settings)[0] for one in tasks]
-    batched = run_batch(sequence, settings, BatchPrograms("default", settings[0].config))
-    programs = Programs("default", settings[0].config)
+    batched = run_batch(sequence, settings)
     ends = set()
     for own, run in zip(settings, batched, strict=True):
         imu, _ = imu_feed(sequence, own)
-        alone = list(track(own, sequence.scans(), imu, CompiledStep(own, programs)))
+        alone = list(track(own, sequence.scans(), imu))
         assert [one.failure for one in alone if one.failure] == [
             failure["message"].split(": ", 1)[1] for failure in run.metrics["failures"]
         ]

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.tuning.loss import Evaluated
+from lio_jax.tuning.gradient import Evaluated
 from lio_jax.tuning.optimise import Bounds, adam, fisher_information, fisher_scoring, lbfgsb
 from lio_jax.tuning.parameters import free_parameters
 from lio_jax.tuning.session import HISTORY, Session
@@ -95,7 +95,7 @@ FREE = free_parameters(default_params(), ["imu.gyro_noise", "lidar.range_sigma"]
 
 def session(folder, loss=None, patience=50, observer=lambda iterate: None):
     evaluate = loss or (lambda x, recordings: noise_likelihood(x))
-    return Session(folder, FREE, evaluate, None, [None], [], True, patience, observer)
+    return Session(folder, FREE, evaluate, [None], [], True, patience, observer)
 
 
 def test_a_killed_tuning_goes_on_from_its_last_iterate(tmp_path):

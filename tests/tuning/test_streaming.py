@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from lio_jax.recipes import RECIPES
-from lio_jax.run.track import CompiledStep, run_steps
-from lio_jax.settings.settings import recipe_settings
+from lio_jax.run.track import Compiled, run_steps
+from lio_jax.settings.settings import recipe_of, recipe_settings
 from lio_jax.tuning.objectives import MarginalLikelihood, Observed
 from lio_jax.tuning.parameters import free_parameters
-from lio_jax.tuning.reverse import CheckpointedGradient
-from lio_jax.tuning.streaming import StreamingGradient
-from lio_jax.tuning.values import StreamingValues
+from lio_jax.tuning.reverse import checkpointed_gradient
+from lio_jax.tuning.streaming import objective_values, streaming_gradient
 from tests.params import DIFFERENTIABLE
 from tests.tuning.recordings import SCANS, TIGHT, DoubleRecording, drive, settings
 
@@ -71,27 +70,23 @@ class Everything(eqx.Module):
 
 
 class HeldMap:
-    """A recipe's step that sees the maps of another run instead of its own."""
+    """A stepper that sees the maps of another run instead of its own."""
 
     def __init__(self, chosen, params, maps):
-        self.step = CompiledStep(chosen) if maps is None else maps.step
-        self.step.params = params
+        self.own = Compiled(recipe_of(chosen), params)
         self.maps = [] if maps is None else maps.maps
         self.replayed = maps is not None
         self.count = 0
 
-    def initial_state(self, imu):
-        return self.step.initial_state(imu)
+    def init(self, imu):
+        return self.own.init(imu)
 
-    def restarted(self, state, imu):
-        return self.step.restarted(state, imu)
-
-    def __call__(self, state, scan, imu):
+    def step(self, state, scan, imu):
         if not self.replayed:
             self.maps.append(jax.tree.map(jnp.copy, state.map))
         state = eqx.tree_at(lambda tree: tree.map, state, jax.tree.map(jnp.copy, self.maps[self.count]))
         self.count += 1
-        return self.step(state, scan, imu)
+        return self.own.step(state, scan, imu)
 
 
 def total(held, recording):
@@ -134,7 +129,7 @@ def check_gradients(recipe: str, inertial: bool) -> None:
     free = free_parameters(chosen.params(), DIFFERENTIABLE)
     assert set(free.paths) == set(DIFFERENTIABLE)
     x = np.asarray(free.first())
-    result = StreamingGradient(recipe, chosen.config, free, Everything())(x, recording)
+    result = streaming_gradient(recipe_of(chosen), free, Everything(), jnp.asarray(x), recording)
 
     nominal = HeldMap(chosen, chosen.params(), None)
     # two programs round differently, and so do the maps they build
@@ -154,8 +149,7 @@ def test_the_marginal_likelihood_has_a_derivative_by_every_leaf():
     chosen = settings("lio_sam", True, *TIGHT)
     recording = DoubleRecording(drive(), chosen, 0, 8)
     free = free_parameters(chosen.params(), DIFFERENTIABLE)
-    program = StreamingGradient("lio_sam", chosen.config, free, MarginalLikelihood(3))
-    result = program(np.asarray(free.first()), recording)
+    result = streaming_gradient(recipe_of(chosen), free, MarginalLikelihood(3), free.first(), recording)
     assert np.isfinite(result.value)
     assert np.isfinite(result.scores).all()
     by_name = dict(zip(free.names, result.gradient, strict=True))
@@ -175,17 +169,17 @@ def test_reverse_mode_and_a_batch_of_parameters_give_the_same_numbers():
     recording = DoubleRecording(drive(), chosen)
     free = free_parameters(chosen.params(), FEW)
     x = np.asarray(free.first())
-    programs = ("default", chosen.config, free, Everything())
-    streamed = StreamingGradient(*programs)(x, recording)
-    value, gradient = CheckpointedGradient(*programs)(x, recording, every=9)
+    objective = recipe_of(chosen), free, Everything()
+    streamed = streaming_gradient(*objective, jnp.asarray(x), recording)
+    value, gradient, _ = checkpointed_gradient(*objective, jnp.asarray(x), recording, every=9)
     assert value == pytest.approx(streamed.value, rel=1e-5)
     np.testing.assert_allclose(gradient, streamed.gradient, rtol=1e-4)
     np.testing.assert_allclose(streamed.scores.sum(0), streamed.gradient, rtol=1e-9)
     assert streamed.scores.shape == (SCANS, len(x))
 
     shifted = x + np.array([0.3, -0.2, 0.1, *np.zeros(7)])
-    alone = StreamingGradient(*programs)(shifted, recording).value
-    values = StreamingValues(*programs)(np.stack([x, shifted]), recording)
+    alone = streaming_gradient(*objective, jnp.asarray(shifted), recording).value
+    values = objective_values(*objective, jnp.stack([x, shifted]), recording)
     np.testing.assert_allclose(values, [streamed.value, alone], rtol=1e-4)
 
 
@@ -193,5 +187,6 @@ def test_a_solve_that_does_not_converge_is_flagged():
     chosen = settings("default", True, *TIGHT, "config.registration.max_iterations=2")
     recording = DoubleRecording(drive(), chosen, 0, 6)
     free = free_parameters(chosen.params(), ["imu.gyro_noise"])
-    result = StreamingGradient("default", chosen.config, free, Everything())(free.first(), recording)
+    objective = recipe_of(chosen), free, Everything()
+    result = streaming_gradient(*objective, free.first(), recording)
     assert result.unconverged == tuple(range(1, 6))

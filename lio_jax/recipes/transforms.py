@@ -1,0 +1,132 @@
+"""Recipes made of recipes: a batch of parameter sets, and derivatives that travel along with the state."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+
+from lio_jax.core.types import ImuBatch, Scan
+from lio_jax.recipes.recipe import State
+
+
+@runtime_checkable
+class RecipeLike(Protocol):
+    """The two pure functions of a recipe, or of a transformed one.
+
+    States have a method ``with_velocity_of(found)`` as those of a recipe do. Equal objects are the same
+    functions: compiled programs are kept by them.
+    """
+
+    def init(self, params: Any, imu: ImuBatch | None = None) -> Any:
+        """Return the state before the first scan."""
+        ...
+
+    def step(self, params: Any, state: Any, scan: Scan, imu: ImuBatch | None = None) -> tuple[Any, Any]:
+        """Return state and output after a scan."""
+        ...
+
+
+@dataclass(frozen=True)
+class Batched:
+    """A recipe over several parameter sets at once; every leaf of params, state and output has them first."""
+
+    recipe: RecipeLike
+
+    def init(self, params: Any, imu: ImuBatch | None = None) -> Any:
+        """Return the states before the first scan."""
+        return jax.vmap(self.recipe.init, (0, None))(params, imu)
+
+    def step(self, params: Any, state: Any, scan: Scan, imu: ImuBatch | None = None) -> tuple[Any, Any]:
+        """Return states and outputs after a scan, which all members share."""
+        return jax.vmap(self.recipe.step, (0, 0, None, None))(params, state, scan, imu)
+
+
+def batched(recipe: RecipeLike) -> Batched:
+    """Return the recipe under ``jax.vmap`` over its parameters."""
+    return Batched(recipe)
+
+
+class Dual(NamedTuple):
+    """A pytree and P derivatives of some of its leaves."""
+
+    value: Any
+    dot: Any
+    """Of the same structure, P along the first axis of each leaf; None for a leaf that is a constant."""
+
+    def with_velocity_of(self, found: "Dual") -> "Dual":
+        """Return this first state with the velocity that a later state found, and its derivatives."""
+        return Dual(self.value.with_velocity_of(found.value), self.dot.with_velocity_of(found.dot))
+
+
+@dataclass(frozen=True)
+class WithTangents:
+    """A recipe whose params, state and output are :class:`Dual`, by forward-mode differentiation."""
+
+    recipe: RecipeLike
+
+    def init(self, params: Dual, imu: ImuBatch | None = None) -> Dual:
+        """Return the state before the first scan and its derivatives."""
+        return push_forward(lambda params: self.recipe.init(params, imu), params)
+
+    def step(self, params: Dual, state: Dual, scan: Scan, imu: ImuBatch | None = None) -> tuple[Dual, Dual]:
+        """Return state and output after a scan, and their derivatives."""
+        both = push_forward(lambda params, state: self.recipe.step(params, state, scan, imu), params, state)
+        new, output = map(Dual, both.value, both.dot)
+        return new, output
+
+
+def with_tangents(recipe: RecipeLike) -> WithTangents:
+    """Return the recipe with derivatives by the parameters; the map is a constant of them.
+
+    Solves are differentiated implicitly (:mod:`lio_jax.core.implicit`): a tangent costs no iterations.
+    """
+    return WithTangents(recipe)
+
+
+def push_forward(function: Callable[..., Any], *arguments: Dual) -> Dual:
+    """Return a function's value and its derivatives.
+
+    Args:
+        function: pure.
+        arguments: P derivatives each.
+    """
+    halves = [_split(argument) for argument in arguments]
+
+    def of_smooth(*smooth: Any) -> tuple[Any, Any]:
+        whole = (eqx.combine(part, rest) for part, (_, rest) in zip(smooth, halves, strict=True))
+        return split_smooth(function(*whole))
+
+    def along(*tangents: Any) -> tuple[Any, Any, Any]:
+        primals = tuple(smooth for smooth, _ in halves)
+        value, dot, rest = jax.jvp(of_smooth, primals, tangents, has_aux=True)
+        return value, rest, dot
+
+    dots = [argument.dot for argument in arguments]
+    value, rest, dot = jax.vmap(along, out_axes=(None, None, 0))(*dots)
+    return Dual(eqx.combine(value, rest), dot)
+
+
+def split_smooth(tree: Any) -> tuple[Any, Any]:
+    """Return what has a derivative in a tree, and the rest: the maps of states, and all counts and choices.
+
+    Each is the tree with None in place of the other's leaves.
+    """
+    smooth = jax.tree.map(_smooth, tree, is_leaf=_is_state)
+    return eqx.partition(tree, smooth)
+
+
+def _split(dual: Dual) -> tuple[Any, Any]:
+    varies = jax.tree.map(lambda dot: dot is not None, dual.dot, is_leaf=lambda dot: dot is None)
+    return eqx.partition(dual.value, varies)
+
+
+def _smooth(node: Any) -> Any:
+    if not _is_state(node):
+        return eqx.is_inexact_array(node)
+    return eqx.tree_at(lambda state: state.map, jax.tree.map(eqx.is_inexact_array, node), False)
+
+
+def _is_state(node: Any) -> bool:
+    return isinstance(node, State)
