@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from lio_jax.core.leaf import numbers_of, section, traced
+from lio_jax.core.leaf import numbers_of, section, settings_of, traced
 from lio_jax.estimation.params import SmootherParams
 from lio_jax.imu.params import OrientedImuConfig
 from lio_jax.lidar.params import (
@@ -66,6 +66,8 @@ class Config(RecipeConfig):
 
 DEFAULTS = numbers_of(Params)
 """Plain numbers by section and name."""
+DIFFERENTIABLE = tuple(path for path, setting in settings_of(Params).items() if setting.declared.tuned)
+"""Paths of the parameters that have a derivative."""
 
 
 def default_params() -> Params:

@@ -57,7 +57,7 @@ def test_a_recipe_brings_its_own_values_and_set_holds_for_all(tmp_path):
     assert (ours.name, loam.name, finer.name) == ("ours", "recipe=loam", "recipe=loam voxel_size=0.5")
     assert loam.settings.recipe == "loam"
     assert loam.settings.values["map"]["voxel_size"] == 0.8
-    assert not loam.settings.config.imu.use
+    assert not hasattr(loam.settings.config, "imu")
     assert all(one.settings.config.map.capacity == 16384 for one in (ours, loam, finer))
 
 

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
+from lio_jax.core.leaf import numbers_of
 from lio_jax.loops.consistency import Consensus, consistent
 from lio_jax.loops.proposals import Proposal
 from lio_jax.loops.verification import Verdict
+from lio_jax.settings.shared import GlobalParams
 from tests.loops.places import keyframe, pose
-from tests.params import DEFAULTS
 
-LIMITS = DEFAULTS["loop"]
+LIMITS = numbers_of(GlobalParams)["loop"]
 RADIUS, COUNT = 40.0, 400
 """Twice around a circle, about 1.3 m a keyframe; the odometry turns and stretches a little too far."""
 

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from lio_jax.core.leaf import numbers_of
 from lio_jax.loops.proposals import metres_from, possible_error
-from tests.params import DEFAULTS
+from lio_jax.settings.shared import GlobalParams
 
-LIMITS = DEFAULTS["loop"]
+LIMITS = numbers_of(GlobalParams)["loop"]
 
 
 def test_without_loops_it_is_the_way_along_the_trajectory():

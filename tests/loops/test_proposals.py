@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
+from lio_jax.core.leaf import numbers_of
 from lio_jax.loops.place_descriptor import Places
 from lio_jax.loops.proposals import described_proposals, external_proposal, is_old, nearest_proposal
+from lio_jax.settings.shared import GlobalParams
 from tests.loops.places import keyframe, pillars, pose, seen_from
-from tests.params import DEFAULTS
 
-LIMITS = DEFAULTS["loop"]
+LIMITS = numbers_of(GlobalParams)["loop"]
 
 
 def test_old_is_what_lies_further_back_than_the_gap():

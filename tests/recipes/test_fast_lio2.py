@@ -1,6 +1,6 @@
 """The recipe fast_lio2 on simulated recordings whose truth is known, with inertial samples and without."""
 
-from functools import cache
+from functools import cache, partial
 
 import equinox as eqx
 import jax

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.core.error_state import EXTRINSIC_ROTATION, EXTRINSIC_TRANSLATION, TIME_OFFSET
 from lio_jax.evaluation.consistency import nees
-from lio_jax.run.fitted_settings import NEAR_VALUES
+from lio_jax.recipes.default import Default
 from lio_jax.run.run import settings_for
 from lio_jax.run.scan_inputs import OFFSET_MARGIN_S, ImuFeed
 from lio_jax.run.track import CompiledStep, ScanResult, pose_matrix, track
@@ -91,7 +91,7 @@ def drive(world, seconds, sets=(), *, inertial=True, moving_start=False, T_imu_l
 
 
 def test_inertial_samples_hold_a_fast_handheld_walk():
-    near = [f"{path}={value}" for path, value in NEAR_VALUES.items()]
+    near = [f"{path}={value}" for path, value in Default.near_values.items()]
     coupled, alone = drive("office", 12.0, near), drive("office", 12.0, near, inertial=False)
     assert not any(item.output.lost for item in coupled.tracked)
     assert coupled.ate < 0.01

@@ -20,6 +20,8 @@ from lio_jax.mapping.feature_map import empty_feature_map
 from lio_jax.recipes.lio_sam import LioSam
 from lio_jax.recipes.smoothed_odometry import match_as_measurement
 from lio_jax.run.scan_inputs import ImuFeed, padded
+from lio_jax.settings.settings import Settings, recipe_settings, with_extrinsics, with_overrides
+from tests.params import DEFAULTS, Params
 from tests.recipes.street import ate, recording, truth
 
 SMALL = [

@@ -1,7 +1,7 @@
 """The recipe loam on simulated recordings whose truth is known, and on scans it was not made for."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import equinox as eqx
 import jax
@@ -18,7 +18,7 @@ from lio_jax.run.run import settings_for
 from lio_jax.run.scan_inputs import padded
 from lio_jax.settings.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.sim.sequence import SimulatedSequence
-from tests.params import Params
+from tests.params import Config, Params
 from tests.recipes.street import ate, recording, truth
 
 SMALL = [

@@ -12,6 +12,7 @@ from lio_jax.run.keyframes import read_keyframes
 from lio_jax.run.map_file import read_cloud
 from lio_jax.run.run import run_sequence, settings_for
 from lio_jax.run.sinks import Sink
+from lio_jax.settings.settings import Settings, with_overrides
 from lio_jax.sim.gps import GpsModel
 from lio_jax.sim.sequence import SimulatedSequence
 from tests.run.small_drive import Replay, moving

@@ -10,6 +10,7 @@ from lio_jax.run import state_files as imu_rate
 from lio_jax.run.logs import TrajectoryLog
 from lio_jax.run.run import run_sequence
 from lio_jax.run.state_files import write_imu_rate
+from lio_jax.settings.settings import Settings
 from tests.run.inertial_drive import InertialReplay, drive, errors, imu, scans
 
 

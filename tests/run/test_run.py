@@ -11,6 +11,7 @@ from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.data.trajectory import read_tum
 from lio_jax.run.run import run_sequence, settings_for
 from lio_jax.run.sinks import Sink
+from lio_jax.settings.settings import with_overrides
 from tests.run.small_drive import COUNT, Replay, moving, without_points
 
 FILES = [

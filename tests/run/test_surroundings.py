@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lio_jax.run.fitted_settings import NEAR_VALUES, fitted_to_surroundings
+from lio_jax.recipes.default import Default
+from lio_jax.run.fitted_settings import fitted_to_surroundings
 from lio_jax.settings.settings import recipe_settings, with_overrides
 from tests.run.small_drive import Replay, moving
 
@@ -53,7 +54,7 @@ def open_ground(height, elevations):
 
 def values(settings):
     params = settings.params()
-    paths = (path.split(".")[1:] for path in NEAR_VALUES)
+    paths = (path.split(".")[1:] for path in Default.near_values)
     return [float(getattr(getattr(params, section), name)) for section, name in paths]
 
 
@@ -61,7 +62,7 @@ def values(settings):
 def test_voxels_are_fine_where_the_surroundings_are_near(within, near):
     settings = recipe_settings("default")
     fitted, notes = fitted_to_surroundings(Seeing(around(within)), settings)
-    assert values(fitted) == pytest.approx(list(NEAR_VALUES.values()) if near else values(settings))
+    assert values(fitted) == pytest.approx(list(Default.near_values.values()) if near else values(settings))
     assert len(notes) == near
     if near:
         assert "90 % of the points within" in notes[0]

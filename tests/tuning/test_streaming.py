@@ -105,7 +105,7 @@ CASES = [
     (recipe, inertial)
     for recipe in RECIPES
     for inertial in (True, False)
-    if (recipe_settings(recipe).config.imu.use or not inertial) and (recipe, inertial) not in NOT_POSSIBLE
+    if (RECIPES[recipe].needs.imu != "unused" or not inertial) and (recipe, inertial) not in NOT_POSSIBLE
 ]
 
 
