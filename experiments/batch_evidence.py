@@ -3,7 +3,7 @@
 A smoother's marginal likelihood takes the error of a scan match for white noise. It has other parts: the
 world of the first scan is tilted by the error of its levelling, the map drifts while the vehicle drives, and
 a sweep that is compensated with a predicted motion keeps the errors of that motion
-(:mod:`lio_jax.imu.sweep_mean_error`). Here each part can be modelled, with states of its own and with the
+(:mod:`lio_jax.imu.strapdown`). Here each part can be modelled, with states of its own and with the
 correlation between a match and the link before it. The problem is linearised once, at the states that were
 smoothed with white noise.
 """
@@ -20,16 +20,16 @@ from lio_jax.core.error_state import BIASES, POSITION, ROTATION, VELOCITY
 from lio_jax.core.geometry import rotation_matrix
 from lio_jax.estimation.block_tridiagonal import BlockTridiagonal, factorise, log_determinant, solve
 from lio_jax.estimation.chain import Chain
-from lio_jax.estimation.imu_factor import imu_information, imu_residual
+from lio_jax.estimation.factors import imu_information, imu_residual
 from lio_jax.estimation.marginal_prior import LOG_2PI
 from lio_jax.estimation.motion_state import DOF, POSE_DOF, MotionState, local_jacobian
 from lio_jax.estimation.pose_logarithm import log_and_jacobian
 from lio_jax.estimation.quadratic import Quadratic
 from lio_jax.imu.discretise import discretise, process_noise
-from lio_jax.imu.increments import NAV_DOF, accumulate, nav_transition, sensitivity
 from lio_jax.imu.params import ImuParams
+from lio_jax.imu.preintegration import NAV_DOF, accumulate, nav_transition, sensitivity
 from lio_jax.imu.sampling import Intervals
-from lio_jax.imu.sweep_mean_error import LAG_DOF, lag_of_inputs, still_to_show
+from lio_jax.imu.strapdown import LAG_DOF, lag_of_inputs, still_to_show
 
 WORLD_SIGMA = jnp.repeat(jnp.array([0.02, 0.001]), 3)
 """Prior standard deviations of the world's attitude and position relative to gravity's world, rad and m."""

@@ -25,9 +25,9 @@ from scipy.optimize import minimize
 
 from lio_jax.commands.runtime import prepare_jax
 from lio_jax.estimation.chain import Chain
+from lio_jax.estimation.factors import PoseMeasurement
 from lio_jax.estimation.marginal_prior import gaussian_prior
 from lio_jax.estimation.motion_state import MotionState
-from lio_jax.estimation.pose_factors import PoseMeasurement
 from lio_jax.estimation.smoother import smooth
 from lio_jax.imu.params import ImuParams
 from lio_jax.imu.preintegration import preintegrate_parallel

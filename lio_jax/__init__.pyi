@@ -22,7 +22,6 @@ from .mapping.frame import Frame as Frame
 from .mapping.voxel_map import anchor_of as anchor_of
 from .recipes.inertial_filter import lidar_pose as lidar_pose
 from .recipes.inertial_filter import predicted as predicted
-from .recipes.output import Output as Output
 from .recipes.params import ExtrinsicsParams as ExtrinsicsParams
 from .recipes.params import InertialConfig as InertialConfig
 from .recipes.params import InertialParams as InertialParams
@@ -31,6 +30,7 @@ from .recipes.params import MotionParams as MotionParams
 from .recipes.params import RecipeConfig as RecipeConfig
 from .recipes.params import RecipeParams as RecipeParams
 from .recipes.recipe import Needs as Needs
+from .recipes.recipe import Output as Output
 from .recipes.recipe import Recipe as Recipe
 from .recipes.recipe import State as State
 from .registration.voxel_planes import associate as associate

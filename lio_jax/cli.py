@@ -102,8 +102,8 @@ def inspect(
         write_config: Write the settings that fit, for --recipe of lio-jax run.
         overwrite: Replace an existing file.
     """
-    from lio_jax.commands.inspect import inspect as command
     from lio_jax.commands.runtime import prepare_jax
+    from lio_jax.commands.show import inspect as command
 
     prepare_jax()
     command(data, set_, json, write_config, overwrite)
@@ -155,7 +155,7 @@ def evaluate(
         reference: Run folder, TUM file or KITTI poses, or a recording that holds ground truth.
         json: Print one JSON object instead of a table.
     """
-    from lio_jax.commands.evaluate import evaluate as command
+    from lio_jax.commands.show import evaluate as command
 
     command(estimate, reference, json)
 
@@ -171,7 +171,7 @@ def report(
         folders: Folders that lio-jax run wrote.
         out: HTML file; None means report.html in the one folder.
     """
-    from lio_jax.commands.report import report as command
+    from lio_jax.commands.show import report as command
 
     command(folders, out)
 
@@ -187,7 +187,7 @@ def view(
         folder: Folder that lio-jax run wrote, or an .rrd.
         web: Serve it to browsers of this computer instead of opening a window.
     """
-    from lio_jax.commands.view import view as command
+    from lio_jax.commands.show import view as command
 
     command(folder, web)
 

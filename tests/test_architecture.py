@@ -117,7 +117,7 @@ def test_the_rule_can_see_an_upward_import(tmp_path, monkeypatch):
         "import lio_jax.viz.plot",
         "from lio_jax import recipes",
         "from ..mapping import voxel_map",
-        "def late():\n    from lio_jax.sim.street import street",
+        "def late():\n    from lio_jax.sim.open_worlds import street",
     ):
         (core / "bad.py").write_text(text)
         assert violations(core / "bad.py"), text

@@ -5,7 +5,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from simulated_chain import IMU, Recording
 
-from lio_jax.estimation.imu_factor import FLOOR
+from lio_jax.estimation.factors import FLOOR
 from lio_jax.estimation.motion_state import MotionState
 from lio_jax.imu.params import ImuParams
 

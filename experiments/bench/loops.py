@@ -121,7 +121,7 @@ def closed(keyframes: "list[Keyframe]") -> "tuple[LoopCloser, Correction, np.nda
 
 def absolute_error(poses: np.ndarray, truth: np.ndarray) -> float:
     """Return the root mean square distance of positions after the best rigid alignment, m."""
-    from lio_jax.evaluation.alignment import align, position_errors
+    from lio_jax.evaluation.trajectory_error import align, position_errors
 
     return float(np.sqrt(np.mean(position_errors(align(poses, truth), poses, truth) ** 2)))
 

@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lio_jax.data.trajectory import Trajectory
-from lio_jax.evaluation.alignment import align
 from lio_jax.evaluation.association import match_by_time
-from lio_jax.evaluation.trajectory_error import absolute_error, relative_error
+from lio_jax.evaluation.trajectory_error import absolute_error, align, relative_error
 
 _WINDOWS = (1, 10)
 """Numbers of scans between the two poses of a pair, against an INS."""

@@ -20,9 +20,8 @@ from lio_jax.commands.sim import truth_beside
 from lio_jax.data.config import DataConfig
 from lio_jax.data.rosbag import RosbagSequence
 from lio_jax.data.trajectory import Trajectory, read_tum
-from lio_jax.evaluation.alignment import align
 from lio_jax.evaluation.association import match_by_time
-from lio_jax.evaluation.trajectory_error import absolute_error
+from lio_jax.evaluation.trajectory_error import absolute_error, align
 
 
 def main() -> None:

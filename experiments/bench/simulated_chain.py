@@ -10,10 +10,9 @@ import jaxlie
 from noise_shares import NoiseShares, noise_shares
 
 from lio_jax.estimation.chain import Chain
-from lio_jax.estimation.imu_factor import predicted
+from lio_jax.estimation.factors import PoseMeasurement, PositionMeasurement, RelativePose, predicted
 from lio_jax.estimation.marginal_prior import gaussian_prior
 from lio_jax.estimation.motion_state import MotionState
-from lio_jax.estimation.pose_factors import PoseMeasurement, PositionMeasurement, RelativePose
 from lio_jax.imu.params import ImuParams
 from lio_jax.imu.preintegration import Preintegrated, preintegrate_parallel
 from lio_jax.imu.sampling import Intervals

@@ -7,8 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from lio_jax.data.prefetch import prefetched
-from lio_jax.data.sequence import Sequence
+from lio_jax.data.sequence import Sequence, prefetched
 from lio_jax.recipes.transforms import batched
 from lio_jax.run.logs import Failures, Overflow, StageTimes, TrajectoryLog
 from lio_jax.run.run import check_start, imu_feed, nothing_read, prediction

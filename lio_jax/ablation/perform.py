@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from lio_jax.ablation.batch import run_batch, same_batch
-from lio_jax.ablation.results import write_result
 from lio_jax.ablation.sources import KeptSequence, Source
-from lio_jax.ablation.store import DiskError, Store
+from lio_jax.ablation.store import DiskError, Store, write_result
 from lio_jax.ablation.tasks import Task
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import atomic_path

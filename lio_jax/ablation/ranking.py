@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import ttest_rel, wilcoxon
 
-from lio_jax.ablation.results import gathered
 from lio_jax.ablation.spec import METRICS, TIME, Spec
-from lio_jax.ablation.store import Store
+from lio_jax.ablation.store import Store, gathered
 from lio_jax.ablation.tasks import Task
 
 Case = tuple[str, int | None]

@@ -2,8 +2,7 @@
 
 from lio_jax.data.detect import open_sequence
 from lio_jax.data.native_writer import write_native
-from lio_jax.data.prefetch import prefetched
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Sequence, SequenceInfo
+from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Sequence, SequenceInfo, prefetched
 from lio_jax.data.trajectory import Trajectory
 
 __all__ = [

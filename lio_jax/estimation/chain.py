@@ -9,10 +9,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.estimation.block_tridiagonal import BlockTridiagonal
-from lio_jax.estimation.imu_factor import imu_information, imu_quadratic
+from lio_jax.estimation.factors import (
+    PoseMeasurement,
+    PositionMeasurement,
+    RelativePose,
+    imu_information,
+    imu_quadratic,
+)
 from lio_jax.estimation.marginal_prior import Prior
 from lio_jax.estimation.motion_state import DOF, POSE_DOF, MotionState
-from lio_jax.estimation.pose_factors import PoseMeasurement, PositionMeasurement, RelativePose
 from lio_jax.estimation.quadratic import Quadratic
 from lio_jax.imu.preintegration import Preintegrated
 

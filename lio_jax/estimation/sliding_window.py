@@ -1,4 +1,5 @@
-"""A chain of bounded length that follows the vehicle: states that leave it become the prior of the others."""
+"""A window of states that is smoothed together, the marginal prior that stands for older ones, and the
+likelihood."""
 
 import dataclasses
 
@@ -8,15 +9,66 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
+from lio_jax.estimation.block_tridiagonal import log_determinant
 from lio_jax.estimation.chain import Chain, information_of, linearise
-from lio_jax.estimation.imu_factor import predicted
-from lio_jax.estimation.marginal_likelihood import log_scale
-from lio_jax.estimation.marginal_prior import Prior, marginalised
+from lio_jax.estimation.factors import (
+    PoseMeasurement,
+    PositionMeasurement,
+    RelativePose,
+    imu_information,
+    predicted,
+)
+from lio_jax.estimation.innovation import square_root_information
+from lio_jax.estimation.marginal_prior import LOG_2PI, Prior, marginalised
 from lio_jax.estimation.motion_state import DOF, MotionState
-from lio_jax.estimation.pose_factors import PoseMeasurement, PositionMeasurement, RelativePose
 from lio_jax.estimation.quadratic import Quadratic
 from lio_jax.estimation.smoother import Smoothed, smooth
 from lio_jax.imu.preintegration import Preintegrated
+
+
+def log_evidence(chain: Chain, smoothed: Smoothed) -> Float[Array, ""]:
+    """Return the log marginal likelihood of all measurements, by Laplace's approximation.
+
+    ``log p(z) = log p(z, x) + DOF n / 2 log(2 pi) - log|H| / 2`` at the most probable states x, with the
+    Gauss-Newton Hessian H (MacKay, "Information theory, inference, and learning algorithms", 2003, chapter
+    27). It is exact for a linear Gaussian model. A robust kernel changes the cost and the Hessian, but not
+    the normalisation of a measurement's density: an outlier keeps a cost, but does not dominate. The
+    derivative is that of the solution and of the log-determinant; no iteration is differentiated.
+
+    Args:
+        chain: the measurements.
+        smoothed: the most probable states of the chain.
+    """
+    matrix = smoothed.normal.matrix
+    volume = DOF * chain.count / 2 * LOG_2PI - log_determinant(matrix) / 2
+    return log_scale(chain) - smoothed.normal.cost + volume
+
+
+def log_scale(chain: Chain) -> Float[Array, ""]:
+    """Return the log-density of all measurements and of the prior if every residual were zero."""
+    present = chain.present()
+    linked = jnp.concatenate([present[1:], jnp.zeros(1, bool)])
+    of_links = jax.vmap(imu_information)(chain.imu.covariance)[1]
+    total = chain.prior.log_scale + _sum(of_links - DOF * LOG_2PI, linked)
+    total += _sum(_of_information(chain.lidar.information), present & chain.lidar.mask)
+    if chain.relative is not None:
+        total += _sum(_of_information(chain.relative.information), linked & chain.relative.mask)
+    if chain.gps is not None:
+        of_axes = -2 * jnp.log(chain.gps.sigma) - LOG_2PI
+        total += _sum(jnp.sum(of_axes, axis=-1), present & chain.gps.mask)
+    return total
+
+
+def _sum(twice: Float[Array, " n"], there: Array) -> Float[Array, ""]:
+    return jnp.sum(jnp.where(there, twice, 0.0)) / 2
+
+
+def _of_information(information: Float[Array, "n d d"]) -> Float[Array, " n"]:
+    """Return log|A| - d log(2 pi) over the d directions of each matrix that have information."""
+    nothing = jnp.zeros(information.shape[:-1], information.dtype)
+    values = jax.vmap(square_root_information)(information, nothing)[2]
+    there = values > 0
+    return jnp.sum(jnp.where(there, jnp.log(jnp.where(there, values, 1.0)) - LOG_2PI, 0.0), axis=-1)
 
 
 class Window(eqx.Module):

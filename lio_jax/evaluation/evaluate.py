@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.data.trajectory import Trajectory
-from lio_jax.evaluation.alignment import Method, align
 from lio_jax.evaluation.association import MatchedTrajectories, match_by_index, match_by_time
 from lio_jax.evaluation.kitti_segments import SegmentErrors, kitti_errors, kitti_short_errors
 from lio_jax.evaluation.load import load_trajectory
-from lio_jax.evaluation.trajectory_error import PoseError, absolute_error, relative_error
+from lio_jax.evaluation.trajectory_error import Method, PoseError, absolute_error, align, relative_error
 
 _LABEL_WIDTH = 30
 

@@ -1,7 +1,4 @@
-"""Absolute and relative pose errors, computed by evo.
-
-Only ``evo.core`` is imported: ``evo.tools`` would write a settings file into the home folder and print.
-"""
+"""Align two trajectories, and measure absolute and relative errors by evo."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
@@ -10,7 +7,94 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.data.trajectory import Trajectory
-from lio_jax.evaluation.alignment import Alignment
+
+# A reference whose rms distance from its mean (m) is below this gives no direction for an alignment.
+_STANDING_SPREAD_M = 0.05
+# Positions fix the rotation about the path's main direction to about residual / sideways spread, rad.
+_UNRELIABLE_ROTATION_RAD = 0.25
+
+Method = Literal["umeyama", "first_pose"]
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Transforms from the estimate's world to the reference's world."""
+
+    T_reference_estimate: NDArray[np.float64]
+    """Transform for positions, (4, 4)."""
+    method: Method
+    T_reference_estimate_attitude: NDArray[np.float64]
+    """Transform for attitudes, (4, 4); it differs where positions do not fix the rotation about the path."""
+    notes: tuple[str, ...]
+
+
+def align(estimate: NDArray[np.float64], reference: NDArray[np.float64]) -> Alignment:
+    """Align by least squares on positions (SE3 Umeyama, no scale), where the path allows it.
+
+    If the vehicle stands still, or with fewer than three poses, the first poses are aligned instead. If the
+    path is so straight, for the size of the error, that the rotation about it is not observable from
+    positions, the least-squares alignment is kept for positions only; attitudes are aligned by the first
+    pose. ``notes`` reports both cases.
+
+    Args:
+        estimate: (n, 4, 4) T_world_body, m, n >= 1.
+        reference: (n, 4, 4) poses of the same body frame at the same instants, m.
+    """
+    by_first_pose = reference[0] @ np.linalg.inv(estimate[0])
+    centred = reference[:, :3, 3] - reference[:, :3, 3].mean(axis=0)
+    spread = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(reference))
+    if len(reference) < 3 or spread[0] < _STANDING_SPREAD_M:
+        why = "there are fewer than three poses" if len(reference) < 3 else "the reference hardly moves"
+        note = f"Aligned by the first pose, because {why}."
+        return Alignment(by_first_pose, "first_pose", by_first_pose, (note,))
+    by_positions = _umeyama(estimate[:, :3, 3], reference[:, :3, 3])
+    residual = np.sqrt(
+        np.mean(np.sum((_positions(by_positions, estimate) - reference[:, :3, 3]) ** 2, axis=1))
+    )
+    if spread[1] * _UNRELIABLE_ROTATION_RAD > max(residual, 1e-9 * spread[0]):
+        return Alignment(by_positions, "umeyama", by_positions, ())
+    note = (
+        "The positions do not fix the rotation about the path's main direction (path too straight for the "
+        "size of the error): attitude errors are taken after alignment by the first pose."
+    )
+    return Alignment(by_positions, "umeyama", by_first_pose, (note,))
+
+
+def position_errors(
+    alignment: Alignment, estimate: NDArray[np.float64], reference: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the (n,) distances between aligned estimate and reference, m."""
+    distance: NDArray[np.float64] = np.linalg.norm(
+        _positions(alignment.T_reference_estimate, estimate) - reference[:, :3, 3], axis=1
+    )
+    return distance
+
+
+def _positions(transform: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    return poses[:, :3, 3] @ transform[:3, :3].T + transform[:3, 3]
+
+
+def _umeyama(estimate: NDArray[np.float64], reference: NDArray[np.float64]) -> NDArray[np.float64]:
+    from evo.core.geometry import GeometryException, umeyama_alignment
+
+    try:
+        rotation, translation, _ = umeyama_alignment(estimate.T, reference.T, with_scale=False)
+    except GeometryException:
+        # evo refuses collinear positions, although each of the equally good rotations would serve positions.
+        rotation, translation = _kabsch(estimate, reference)
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation, translation
+    return transform
+
+
+def _kabsch(
+    estimate: NDArray[np.float64], reference: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    mean_estimate, mean_reference = estimate.mean(axis=0), reference.mean(axis=0)
+    u, _, vt = np.linalg.svd((reference - mean_reference).T @ (estimate - mean_estimate))
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return rotation, mean_reference - rotation @ mean_estimate
+
 
 if TYPE_CHECKING:
     from evo.core.metrics import PE
@@ -43,7 +127,7 @@ def absolute_error(estimate: Trajectory, reference: Trajectory, alignment: Align
     Args:
         estimate: T_world_body.
         reference: T_world_body of the same body frame at the same instants.
-        alignment: result of :func:`lio_jax.evaluation.alignment.align`.
+        alignment: result of :func:`lio_jax.evaluation.trajectory_error.align`.
     """
     from evo.core.metrics import APE, PoseRelation
 

@@ -20,18 +20,20 @@ from lio_jax.core.errors import UsageError
 from lio_jax.core.types import Scan
 from lio_jax.core.xla import computed_once
 from lio_jax.lidar.params import Config, Params
-from lio_jax.lidar.picking import Picks, Ring, pick, sector_bounds
-from lio_jax.lidar.range_image import RangeImage, range_image
-from lio_jax.lidar.ring_voxel_mean import mean_per_ring_and_voxel
-from lio_jax.lidar.smoothness import (
+from lio_jax.lidar.picking import (
+    Picks,
+    Ring,
     after_each,
     occluded,
     parallel_to_beam,
+    pick,
     point_smoothness,
     range_smoothness,
     reach,
+    sector_bounds,
 )
-from lio_jax.lidar.thinning import mean_per_voxel
+from lio_jax.lidar.range_image import RangeImage, range_image
+from lio_jax.lidar.thinning import mean_per_ring_and_voxel, mean_per_voxel
 
 
 class FeatureCloud(eqx.Module):

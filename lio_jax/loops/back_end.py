@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from lio_jax.core.pose_covariance import carried
+from lio_jax.core.geometry import carried
 from lio_jax.loops.closing import held_by
 from lio_jax.loops.gps import Fix, GpsGate, Refusal, alignment
 from lio_jax.loops.keyframe import Keyframe

@@ -1,4 +1,4 @@
-"""A map of corners and surface points (LOAM, LIO-SAM), each kind one per voxel in a hashed table."""
+"""Maps of corners and surface points: one point per voxel, in cubes (LOAM) or from keyframes (LIO-SAM)."""
 
 from collections.abc import Callable
 
@@ -8,8 +8,9 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from lio_jax.mapping.frame import Frame
-from lio_jax.mapping.params import FeatureMapParams, PointMapParams
-from lio_jax.mapping.point_map import EDGE, Insertion, PointMap, empty_map, insert
+from lio_jax.mapping.keyframes import KeyframeCloud, Keyframes, next_to_enter, with_keyframe
+from lio_jax.mapping.params import CubeGridParams, CubeParams, FeatureMapParams, PointMapParams, SubmapParams
+from lio_jax.mapping.point_map import EDGE, Insertion, PointMap, empty_map, insert, move_cube, shift_box
 from lio_jax.mapping.voxel_map import anchor_of
 
 
@@ -105,3 +106,114 @@ def added_to(
         maps.append(follow(pmap, frame, block))
         insertions.append(insertion)
     return FeatureMap(*maps), insertions[0], insertions[1]
+
+
+def matched_cubes(
+    placed: Float[Array, "k 3"], frame: Frame, position: Float[Array, "3"], cubes: CubeGridParams
+) -> Bool[Array, " k"]:
+    """Return which points lie in the cubes around the sensor's own.
+
+    Cubes are centred on multiples of their edge, counted from the world's origin.
+
+    Args:
+        placed: m, in ``frame``.
+        frame: near the sensor.
+        position: of the sensor, m in world.
+        cubes: their edge, and how many are matched.
+    """
+    numbers = jnp.stack([cubes.matched_across, cubes.matched_across, cubes.matched_up])
+    own = jnp.round(position / cubes.edge) * cubes.edge
+    away = placed - (own - frame.origin).astype(placed.dtype)
+    return jnp.all(jnp.abs(away) < (numbers / 2 * cubes.edge).astype(placed.dtype), -1)
+
+
+def added_to_cubes(
+    cubes_map: FeatureMap,
+    points: FeaturePoints,
+    keep: Bool[Array, ""],
+    frames: Frames,
+    map_params: FeatureMapParams,
+    point_map: PointMapParams,
+    cubes: CubeGridParams,
+) -> tuple[FeatureMap, Insertion, Insertion]:
+    """Return the map with a scan's points, its grid shifted to the sensor; and what was added of either kind.
+
+    Args:
+        cubes_map: donate it.
+        points: each kind in its frame, m.
+        keep: whether to add any.
+        frames: near the sensor.
+        map_params: for the voxel sizes.
+        point_map: for ``nearer_by``.
+        cubes: the grid.
+    """
+    half_sides = jnp.stack([cubes.across, cubes.across, cubes.up]) / 2 * cubes.edge
+
+    def follow(pmap: PointMap, frame: Frame, block: Float[Array, ""]) -> PointMap:
+        cube = (cubes.edge / block).astype(jnp.float32)
+        half = (half_sides / block).astype(jnp.float32)
+        return shift_box(pmap, frame.anchor, half, cubes.margin.astype(jnp.float32) * cube, cube)
+
+    return added_to(cubes_map, points, keep, frames, map_params, point_map, half_sides, follow)
+
+
+class Submap(eqx.Module):
+    """Keyframes, and the points of those around the vehicle."""
+
+    keyframes: Keyframes
+    """Keyframes with their clouds."""
+    features: FeatureMap
+    """Map of the points of the keyframes around the vehicle."""
+
+
+def with_scan(
+    submap: Submap,
+    keep: Bool[Array, ""],
+    points: FeaturePoints,
+    T_world_lidar: jaxlie.SE3,
+    time: Float[Array, ""],
+    map_params: FeatureMapParams,
+    point_map: CubeParams,
+    settings: SubmapParams,
+) -> tuple[Submap, Frames, FeaturePoints, tuple[Insertion, Insertion]]:
+    """Return the submap with a scan as a keyframe, and with one that the vehicle comes back to, if any.
+
+    Args:
+        submap: donate it.
+        keep: whether the scan becomes a keyframe.
+        points: of the scan, compensated, m, lidar frame.
+        T_world_lidar: its pose.
+        time: s, on the keyframes' clock.
+        map_params: for the voxel sizes.
+        point_map: for the side of the box around the vehicle and ``nearer_by``.
+        settings: what a keyframe is, and when one enters anew.
+
+    Returns:
+        The submap, the frames of its points near the scan, the scan's points in them, and what was added of
+        either kind: the scan's points first.
+    """
+    single = [kind.astype(jnp.float32) for kind in (points.corner, points.surface)]
+    cloud = KeyframeCloud(single[0], points.corner_mask, single[1], points.surface_mask)
+    keyframes = with_keyframe(submap.keyframes, keep, T_world_lidar, time, cloud, settings)
+    keyframes, T_world_back, back = next_to_enter(keyframes, T_world_lidar, time, settings)
+    frames = frames_at(T_world_lidar.translation(), map_params)
+    placed = placed_in(frames, points, T_world_lidar)
+    returned = FeaturePoints(back.corner, back.corner_mask, back.surface, back.surface_mask)
+    entering = placed_in(frames, returned, T_world_back)
+    both = FeaturePoints(
+        corner=jnp.concatenate([placed.corner.astype(jnp.float32), entering.corner]),
+        corner_mask=jnp.concatenate([placed.corner_mask & keep, entering.corner_mask]),
+        surface=jnp.concatenate([placed.surface.astype(jnp.float32), entering.surface]),
+        surface_mask=jnp.concatenate([placed.surface_mask & keep, entering.surface_mask]),
+    )
+    half_side = point_map.cube_side_length / 2
+    margin = half_side / 2
+
+    def follow(pmap: PointMap, frame: Frame, block: Float[Array, ""]) -> PointMap:
+        in_blocks = (jnp.stack([half_side, margin]) / block).astype(jnp.float32)
+        return move_cube(pmap, frame.anchor, in_blocks[0], in_blocks[1])
+
+    features, *added = added_to(
+        submap.features, both, jnp.array(True), frames, map_params, point_map, half_side, follow
+    )
+    return Submap(keyframes, features), frames, placed, (added[0], added[1])

@@ -15,8 +15,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components, depth_first_order
 
 from lio_jax.pose_graph import multifrontal
-from lio_jax.pose_graph.elimination_tree import EliminationTree, elimination_tree
-from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError
+from lio_jax.pose_graph.multifrontal import EliminationTree, NotPositiveDefiniteError, elimination_tree
 
 _Numbers = NDArray[np.int64]
 _Flags = NDArray[np.bool_]

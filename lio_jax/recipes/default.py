@@ -6,8 +6,7 @@ from typing import ClassVar
 from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.recipes import lidar_inertial, lidar_odometry
 from lio_jax.recipes.default_params import Config, Params
-from lio_jax.recipes.output import Output
-from lio_jax.recipes.recipe import Recipe
+from lio_jax.recipes.recipe import Output, Recipe
 
 State = lidar_inertial.State | lidar_odometry.State
 

@@ -33,11 +33,16 @@ from lio_jax.recipes.constant_velocity import (
     unlevelled_start,
     until_its_middle,
 )
-from lio_jax.recipes.inertial_filter import levelled_start, lidar_pose, predicted
-from lio_jax.recipes.output import Output
+from lio_jax.recipes.inertial_filter import (
+    corrected,
+    evidence_of,
+    levelled_start,
+    lidar_pose,
+    predicted,
+    registration_of,
+)
 from lio_jax.recipes.params import InertialConfig, InertialParams
-from lio_jax.recipes.recipe import Needs, Recipe
-from lio_jax.recipes.scan_update import corrected, evidence_of, registration_of
+from lio_jax.recipes.recipe import Needs, Output, Recipe
 from lio_jax.registration.knn_planes import ScanToPoints
 from lio_jax.registration.params import (
     FilterMatch,

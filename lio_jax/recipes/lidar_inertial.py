@@ -20,9 +20,15 @@ from lio_jax.lidar.thinning import ThinnedScan, thinned
 from lio_jax.mapping.voxel_map import VoxelMap, empty_map, insert
 from lio_jax.recipes import recipe
 from lio_jax.recipes.default_params import Config, Params
-from lio_jax.recipes.inertial_filter import levelled_start, lidar_pose, predicted
-from lio_jax.recipes.output import Output
-from lio_jax.recipes.scan_update import corrected, evidence_of, registration_of
+from lio_jax.recipes.inertial_filter import (
+    corrected,
+    evidence_of,
+    levelled_start,
+    lidar_pose,
+    predicted,
+    registration_of,
+)
+from lio_jax.recipes.recipe import Output
 from lio_jax.registration.point_evidence import point_evidence
 from lio_jax.registration.scan_match import FixedPoints
 from lio_jax.registration.voxel_planes import ScanToVoxels

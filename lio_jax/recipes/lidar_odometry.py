@@ -17,7 +17,7 @@ from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
 from lio_jax.recipes import recipe
 from lio_jax.recipes.default_params import Config, Params
-from lio_jax.recipes.output import Output
+from lio_jax.recipes.recipe import Output
 from lio_jax.recipes.trial_motion import TrialMotion
 from lio_jax.registration.gauss_newton import gauss_newton
 from lio_jax.registration.voxel_planes import ScanToVoxels

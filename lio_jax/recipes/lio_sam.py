@@ -23,16 +23,14 @@ from lio_jax.core.errors import UsageError
 from lio_jax.core.geometry import from_blocks
 from lio_jax.core.status import CONVERGED, ITERATION_LIMIT
 from lio_jax.core.types import ImuBatch, NavState, Scan, state_dtype
-from lio_jax.estimation.marginal_likelihood import log_evidence
 from lio_jax.estimation.motion_state import DOF
-from lio_jax.estimation.sliding_window import Window
+from lio_jax.estimation.sliding_window import Window, log_evidence
 from lio_jax.estimation.smoother import Smoothed
 from lio_jax.lidar.features import (
     check_sizes,
 )
-from lio_jax.mapping.feature_map import empty_feature_map
+from lio_jax.mapping.feature_map import Submap, empty_feature_map
 from lio_jax.mapping.keyframes import no_keyframes
-from lio_jax.mapping.submap import Submap
 from lio_jax.recipes.inertial_filter import levelled_start, lidar_pose
 from lio_jax.recipes.lio_sam_params import Config, Params
 from lio_jax.recipes.lio_sam_stages import (
@@ -51,10 +49,8 @@ from lio_jax.recipes.lio_sam_stages import (
     scan_to_map,
     smooth,
 )
-from lio_jax.recipes.output import Output
-from lio_jax.recipes.pose_limits import measured_attitude
-from lio_jax.recipes.recipe import Needs, Recipe
-from lio_jax.recipes.smoothed_odometry import opened
+from lio_jax.recipes.recipe import Needs, Output, Recipe
+from lio_jax.recipes.smoothed_odometry import measured_attitude, opened
 
 
 class LioSam(Recipe[Config, Params, State]):

@@ -28,15 +28,20 @@ from lio_jax.lidar.features import (
     lio_sam_features,
     thinned_features,
 )
-from lio_jax.mapping.feature_map import FeaturePoints, Frames
+from lio_jax.mapping.feature_map import FeaturePoints, Frames, Submap, with_scan
 from lio_jax.mapping.keyframes import is_due
 from lio_jax.mapping.point_map import Insertion
-from lio_jax.mapping.submap import Submap, with_scan
 from lio_jax.recipes import recipe
 from lio_jax.recipes.inertial_filter import lidar_pose
 from lio_jax.recipes.lio_sam_params import Config, Params
-from lio_jax.recipes.pose_limits import drawn_to_tilt, measured_attitude, within_limits
-from lio_jax.recipes.smoothed_odometry import match_as_measurement, opened, runs_away
+from lio_jax.recipes.smoothed_odometry import (
+    drawn_to_tilt,
+    match_as_measurement,
+    measured_attitude,
+    opened,
+    runs_away,
+    within_limits,
+)
 from lio_jax.registration.feature_match import ScanToSubmap
 from lio_jax.registration.gauss_newton import Registration, gauss_newton
 from lio_jax.registration.scan_match import FixedPoints

@@ -29,13 +29,18 @@ from lio_jax.lidar.features import (
     thinned_features,
 )
 from lio_jax.lidar.params import LidarParams, LoamFeatureParams, LoamRingConfig
-from lio_jax.mapping.cube_map import added_to
-from lio_jax.mapping.feature_map import FeatureMap, FeaturePoints, empty_feature_map, frames_at, placed_in
+from lio_jax.mapping.feature_map import (
+    FeatureMap,
+    FeaturePoints,
+    added_to_cubes,
+    empty_feature_map,
+    frames_at,
+    placed_in,
+)
 from lio_jax.mapping.params import CubeGridParams, FeatureMapParams, MapConfig, PointMapParams
 from lio_jax.recipes import recipe
-from lio_jax.recipes.output import Output
 from lio_jax.recipes.params import RecipeConfig, RecipeParams
-from lio_jax.recipes.recipe import Needs, Recipe
+from lio_jax.recipes.recipe import Needs, Output, Recipe
 from lio_jax.recipes.trial_motion import TrialMotion
 from lio_jax.registration.feature_match import ScanToCubes
 from lio_jax.registration.gauss_newton import Registration, gauss_newton
@@ -226,7 +231,7 @@ class Loam(Recipe[Config, Params, State]):
             last = _last(config, features, motion, jax.lax.stop_gradient(odometry.T_world_lidar))
             frames = frames_at(jax.lax.stop_gradient(T.translation()), params.map)
             placed = jax.lax.stop_gradient(placed_in(frames, thin, T))
-            cubes, *added = added_to(
+            cubes, *added = added_to_cubes(
                 state.map.cubes,
                 placed,
                 its_turn & ~lost,

@@ -11,8 +11,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.lidar.params import LidarParams
-from lio_jax.mapping.cube_map import matched_cubes
-from lio_jax.mapping.feature_map import FeatureMap, FeaturePoints, Frames, frames_at
+from lio_jax.mapping.feature_map import FeatureMap, FeaturePoints, Frames, frames_at, matched_cubes
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.params import CubeGridParams, FeatureMapParams
 from lio_jax.registration.knn_planes import planes_near

@@ -1,6 +1,9 @@
-"""The back end of a run: what it is fed with, and the files it leaves in the run folder."""
+"""The back end as a sink: it runs on a thread of its own and corrects the trajectory at the end."""
 
+import queue
 import tempfile
+import threading
+import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -17,10 +20,9 @@ from lio_jax.data.trajectory import Trajectory, ns_to_seconds, write_tum
 from lio_jax.loops.back_end import BackEnd, Correction, corrected_poses, graph_of
 from lio_jax.loops.closing import LoopCloser
 from lio_jax.loops.gps import GpsGate
-from lio_jax.loops.keyframe import thinned
+from lio_jax.loops.keyframe import Keyframe, thinned
 from lio_jax.pose_graph.g2o import write_graph
 from lio_jax.pose_graph.graph import LOOP, ODOMETRY, PoseGraph
-from lio_jax.run.backend_thread import BackEndThread
 from lio_jax.run.folder import write_json
 from lio_jax.run.keyframes import KeyframePicker, KeyframeWriter, corner_marks, read_keyframes
 from lio_jax.run.map_file import MapTiles, read_cloud
@@ -28,6 +30,58 @@ from lio_jax.run.sinks import RunResult, Sink
 from lio_jax.run.state_files import StateFiles
 from lio_jax.run.track import ScanResult
 from lio_jax.settings.settings import Settings
+
+
+class BackEndThread:
+    """Hands keyframes to a back end, which takes them in order, one at a time."""
+
+    def __init__(self, back_end: BackEnd) -> None:
+        """Begin to wait for keyframes.
+
+        Args:
+            back_end: belongs to the thread until :meth:`finish`.
+        """
+        self._back_end = back_end
+        self._waiting: queue.SimpleQueue[Keyframe | None] = queue.SimpleQueue()
+        self._stopped = threading.Event()
+        self.error: Exception | None = None
+        """What ended the work early."""
+        self.busy_s = 0.0
+        """Time spent on keyframes."""
+        # a daemon: whatever ends the program must not wait for the queue to be worked off
+        self._thread = threading.Thread(target=self._work, name="back end", daemon=True)
+        self._thread.start()
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Hand over the next keyframe and return at once."""
+        self._waiting.put(keyframe)
+
+    def finish(self, hurry: bool = False) -> Correction:
+        """Return the correction of all keyframes; in a hurry, of those it has dealt with.
+
+        Where the work ended with an error, the correction is that of the keyframes before.
+        """
+        if hurry:
+            self._stopped.set()
+        self._waiting.put(None)
+        self._thread.join()
+        return self._back_end.correction()
+
+    def stop(self) -> None:
+        """Let the thread end after the keyframe it is at, without waiting for it."""
+        self._stopped.set()
+        self._waiting.put(None)
+
+    def _work(self) -> None:
+        try:
+            while (keyframe := self._waiting.get()) is not None and not self._stopped.is_set():
+                began = time.perf_counter()
+                self._back_end.add(keyframe)
+                self.busy_s += time.perf_counter() - began
+            self._back_end.settle()
+        except Exception as error:
+            self.error = error
+
 
 _KEPT_SPACING = 0.4
 """Of the points that keyframes keep in memory for loops, m; on disk they have all."""

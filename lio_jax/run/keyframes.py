@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import atomic_path
-from lio_jax.core.pose_covariance import carried
+from lio_jax.core.geometry import carried
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.pose_graph.g2o import Edge
 from lio_jax.run.track import ScanResult

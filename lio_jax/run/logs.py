@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.files import atomic_path
-from lio_jax.core.pose_covariance import carried, covariance_of
+from lio_jax.core.geometry import carried, covariance_of
 from lio_jax.core.types import NavState
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.run.sinks import RunResult, Sink

@@ -11,8 +11,7 @@ from typing import Any
 
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.data.imu_checks import cleaned
-from lio_jax.data.prefetch import prefetched
-from lio_jax.data.sequence import LidarScan, Sequence
+from lio_jax.data.sequence import LidarScan, Sequence, prefetched
 from lio_jax.imu.params import OrientedImuConfig
 from lio_jax.recipes.params import InertialConfig
 from lio_jax.run.fitted_settings import fitted_to_surroundings, with_sensor_sizes

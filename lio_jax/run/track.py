@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.core.xla import programs
 from lio_jax.data.sequence import LidarScan
-from lio_jax.recipes.opening import Stepper, reopened
 from lio_jax.recipes.params import RecipeParams as Params
-from lio_jax.recipes.transforms import RecipeLike
+from lio_jax.recipes.transforms import RecipeLike, Stepper, reopened
 from lio_jax.run.failures import Evidence, failure_of, longest_gap
 from lio_jax.run.scan_inputs import ImuFeed, bucket_for, padded
 from lio_jax.settings.settings import Settings, recipe_of

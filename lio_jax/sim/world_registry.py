@@ -4,11 +4,9 @@ from collections.abc import Callable
 
 from lio_jax.core.errors import UsageError
 from lio_jax.sim.city import city
-from lio_jax.sim.field import field
 from lio_jax.sim.office import office
-from lio_jax.sim.room import room
+from lio_jax.sim.open_worlds import field, room, street
 from lio_jax.sim.stairs import stairs
-from lio_jax.sim.street import street
 from lio_jax.sim.tunnel import tunnel
 from lio_jax.sim.worlds import Scene
 

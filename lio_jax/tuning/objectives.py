@@ -14,8 +14,8 @@ from lio_jax.core.errors import UsageError
 from lio_jax.core.types import ImuBatch, NavState, Scan, state_dtype
 from lio_jax.lidar.params import BeamParams
 from lio_jax.lidar.range_scatter import range_scatter
-from lio_jax.recipes.output import Evidence
 from lio_jax.recipes.params import RecipeParams as Params
+from lio_jax.recipes.recipe import Evidence
 from lio_jax.recipes.transforms import RecipeLike
 from lio_jax.registration.point_evidence import PointEvidence
 from lio_jax.tuning.objective_names import EXAMPLE, LISTED, SHORT

@@ -95,7 +95,7 @@ class _Taped:
 
 
 class _Tape:
-    """A :class:`lio_jax.recipes.opening.Stepper` that remembers what it did."""
+    """A :class:`lio_jax.recipes.transforms.Stepper` that remembers what it did."""
 
     def __init__(
         self, recipe: RecipeLike, params: tuple[Params, Params], objective: Objective, every: int

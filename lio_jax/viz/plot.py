@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import atomic_path
 from lio_jax.data.trajectory import Trajectory
-from lio_jax.evaluation.alignment import align, position_errors
 from lio_jax.evaluation.association import match_by_time
+from lio_jax.evaluation.trajectory_error import align, position_errors
 from lio_jax.imu.allan import NoiseFit
 
 if TYPE_CHECKING:

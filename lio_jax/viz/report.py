@@ -1,12 +1,19 @@
-"""Write a run's report.html, the overview of its results; it needs only the run's folder."""
+"""HTML reports: of one run, and of several runs next to each other."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from lio_jax.core.errors import UsageError
 from lio_jax.core.files import atomic_path
+from lio_jax.evaluation.trajectory_error import position_errors
 from lio_jax.viz import run_figures
-from lio_jax.viz.html import bullets, figures, folded, page, paragraph, section, table, tiles
+from lio_jax.viz.html import bullets, figure, figures, folded, page, paragraph, section, table, tiles
+from lio_jax.viz.run_figures import relative_error_groups, way_of
 from lio_jax.viz.run_record import RunRecord, read_run
+from lio_jax.viz.svg import Line, box_chart, empty, equal_axes, line_chart, plan_chart
 
 _FAILURES_SHOWN = 50
 
@@ -114,3 +121,157 @@ def _complaints(run: RunRecord) -> list[str]:
 
 def _metres(value: float | None) -> str:
     return "not finite" if value is None else f"{value:.3g} m"
+
+
+def write_comparison(folders: Sequence[Path], out: Path) -> None:
+    """Write a page that compares the runs of several folders.
+
+    Raises:
+        LioJaxError: a folder is not a run's, or a file of it is damaged.
+        UsageError: a folder is given twice.
+    """
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise UsageError("the same folder is given twice; a run compared with itself shows nothing.")
+    text = comparison([read_run(folder) for folder in folders])
+    with atomic_path(out) as aside:
+        aside.write_text(text, encoding="utf-8")
+
+
+def comparison(runs: Sequence[RunRecord]) -> str:
+    """Return the page as HTML."""
+    names = _names(runs)
+    legend = [(name, number) for number, name in enumerate(names)]
+    return page(
+        f"lio-jax: {len(runs)} runs compared",
+        [
+            section("Numbers", _numbers(names, runs)),
+            section("What was set differently", _differences(names, runs)),
+            section("Trajectory", figures(_from_above(runs, legend), _heights(runs, legend))),
+            section("Errors", figures(*_errors(runs, legend), *_drift(names, runs))),
+            section("Time", figures(_times(names, runs))),
+            section("Complaints", *_complaints_of(names, runs)),
+        ],
+    )
+
+
+def _names(runs: Sequence[RunRecord]) -> list[str]:
+    """Return the folders' names, with as much of their paths as makes them unique."""
+    parts = [run.folder.resolve().parts for run in runs]
+    for length in range(1, max(map(len, parts)) + 1):
+        names = ["/".join(part[-length:]) for part in parts]
+        if len(set(names)) == len(names):
+            return names
+    return [str(run.folder) for run in runs]
+
+
+def _numbers(names: list[str], runs: Sequence[RunRecord]) -> str:
+    values = [{"recipe": str(run.config.get("recipe", ""))} | headline(run) for run in runs]
+    rows = list(dict.fromkeys(name for numbers in values for name in numbers))
+    recordings = {str(run.metrics.get("recording", {}).get("name")) for run in runs}
+    warning = "These runs are of different recordings: " + ", ".join(sorted(recordings)) + "."
+    numbers = table(("", *names), [(row, *(numbers.get(row, "-") for numbers in values)) for row in rows])
+    return (paragraph(warning) if len(recordings) > 1 else "") + numbers
+
+
+def _differences(names: list[str], runs: Sequence[RunRecord]) -> str:
+    leaves = [_leaves(run.config) for run in runs]
+    paths = dict.fromkeys(path for values in leaves for path in values)
+    rows = [
+        (path, *(_text(values.get(path, "-")) for values in leaves))
+        for path in paths
+        if len({str(values.get(path)) for values in leaves}) > 1
+    ]
+    return table(("", *names), rows) if rows else paragraph("Nothing: the settings are the same.")
+
+
+def _text(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _leaves(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in tree.items():
+        found |= _leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return found
+
+
+def _from_above(runs: Sequence[RunRecord], legend: list[tuple[str, int]]) -> str:
+    lines = []
+    for number, run in enumerate(runs):
+        xy = run.trajectory.positions
+        lines.append(Line(xy[:, 0], xy[:, 1], number))
+    compared = next((run.comparison for run in runs if run.comparison), None)
+    if compared:
+        xy = compared.truth.positions
+        lines.append(Line(xy[:, 0], xy[:, 1], 7, dashed=True))
+        legend = [*legend, ("truth, aligned with the first run that has it", 7)]
+    axes = equal_axes([line.x for line in lines], [line.y for line in lines])
+    svg = empty("no pose is finite") if axes is None else plan_chart(axes, lines, "x [m]", "y [m]")
+    return figure(
+        "From above", svg, "Each in its own world, which begins at its first pose.", legend, wide=True
+    )
+
+
+def _heights(runs: Sequence[RunRecord], legend: list[tuple[str, int]]) -> str:
+    lines = [Line(run.distance, run.trajectory.positions[:, 2], number) for number, run in enumerate(runs)]
+    svg = line_chart(lines, "distance travelled [m]", "z [m]")
+    return figure("From the side", svg, "Height over the way.", legend)
+
+
+def _errors(runs: Sequence[RunRecord], legend: list[tuple[str, int]]) -> list[str]:
+    lines, known = [], []
+    for number, run in enumerate(runs):
+        if not run.comparison:
+            continue
+        matched = run.comparison.matched
+        metres = position_errors(run.comparison.alignment, matched.estimate.poses, matched.reference.poses)
+        lines.append(Line(way_of(run, matched.estimate), metres, number))
+        known.append(legend[number])
+    if not lines:
+        return []
+    svg = line_chart(lines, "distance travelled [m]", "position error [m]", from_zero=True)
+    return [figure("Position error over distance", svg, "Each aligned on its own.", known)]
+
+
+def _drift(names: list[str], runs: Sequence[RunRecord]) -> list[str]:
+    groups = {
+        name: relative_error_groups(run.comparison)
+        for name, run in zip(names, runs, strict=True)
+        if run.comparison
+    }
+    shared = set.intersection(*(set(metres) for metres, _ in groups.values())) if groups else set()
+    if not shared:
+        return []
+    length = max(shared, key=lambda name: float(name.split()[0]))
+    series = [number for number, name in enumerate(names) if name in groups]
+    caption = f"Over {length} from every pose on; box: quartiles, whiskers: 5 and 95 %, dot: largest."
+    return [
+        figure(
+            title,
+            box_chart({name: group[kind][length] for name, group in groups.items()}, unit, series),
+            caption,
+        )
+        for kind, (title, unit) in enumerate(
+            (("Relative position error", "error [% of the way]"), ("Relative attitude error", "error [deg]"))
+        )
+    ]
+
+
+def _times(names: list[str], runs: Sequence[RunRecord]) -> str:
+    totals = {
+        name: np.asarray(run.scans["total_ms"])
+        for name, run in zip(names, runs, strict=True)
+        if "total_ms" in run.scans
+    }
+    series = [number for number, name in enumerate(names) if name in totals]
+    caption = "Box: quartiles, whiskers: 5 and 95 %, dot: largest."
+    return figure("Time of a scan", box_chart(totals, "time [ms]", series), caption) if totals else ""
+
+
+def _complaints_of(names: list[str], runs: Sequence[RunRecord]) -> list[str]:
+    said = []
+    for name, run in zip(names, runs, strict=True):
+        failures = len(run.metrics.get("failures", []))
+        said += [f"{name}: {failures} failed scans"] * (failures > 0)
+        said += [f"{name}: {sentence}" for sentence in (*run.metrics.get("warnings", []), *run.remarks)]
+    return [bullets(said, bad=True) or paragraph("None.")]

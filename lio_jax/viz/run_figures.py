@@ -11,8 +11,8 @@ from scipy.stats import chi2
 
 from lio_jax.core.error_state import ACCEL_BIAS, GYRO_BIAS
 from lio_jax.data.trajectory import Trajectory
-from lio_jax.evaluation.alignment import position_errors
 from lio_jax.evaluation.kitti_segments import relative_errors, segment_ends
+from lio_jax.evaluation.trajectory_error import position_errors
 from lio_jax.viz.html import figure
 from lio_jax.viz.run_record import Comparison, RunRecord
 from lio_jax.viz.svg import WIDTH, Line, box_chart, empty, equal_axes, line_chart, plan_chart, stack_chart

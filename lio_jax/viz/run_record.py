@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data.trajectory import Trajectory, read_tum
-from lio_jax.evaluation.alignment import Alignment, align
 from lio_jax.evaluation.association import MatchedTrajectories, match_by_time
+from lio_jax.evaluation.trajectory_error import Alignment, align
 from lio_jax.run.keyframes import read_keyframes
 from lio_jax.run.map_file import read_cloud
 

@@ -10,9 +10,8 @@ import pytest
 from lio_jax.ablation import perform as performing
 from lio_jax.ablation.batch import run_batch
 from lio_jax.ablation.perform import perform
-from lio_jax.ablation.results import gathered
 from lio_jax.ablation.spec import METRICS, load_spec
-from lio_jax.ablation.store import DiskError, opened
+from lio_jax.ablation.store import DiskError, gathered, opened
 from lio_jax.ablation.tasks import tasks_of
 from lio_jax.commands.runtime import prepare_jax
 from lio_jax.core.errors import LioJaxError

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.linalg import expm, logm
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.pose_covariance import adjoint_of, carried, covariance_of
+from lio_jax.core.geometry import adjoint_of, carried, covariance_of
 
 
 def _pose(rotation, position):

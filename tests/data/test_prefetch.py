@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from lio_jax.data.prefetch import prefetched
+from lio_jax.data.sequence import prefetched
 
 
 def prefetch_threads() -> list[threading.Thread]:

@@ -9,10 +9,9 @@ import jaxlie
 import numpy as np
 
 from lio_jax.estimation.chain import Chain
-from lio_jax.estimation.imu_factor import FLOOR, predicted
+from lio_jax.estimation.factors import FLOOR, PoseMeasurement, predicted
 from lio_jax.estimation.marginal_prior import gaussian_prior
 from lio_jax.estimation.motion_state import MotionState
-from lio_jax.estimation.pose_factors import PoseMeasurement
 from lio_jax.imu.params import ImuParams
 from lio_jax.imu.preintegration import preintegrate_parallel
 from lio_jax.imu.sampling import Intervals

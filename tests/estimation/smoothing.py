@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 
 from lio_jax.estimation.chain import Chain
-from lio_jax.estimation.marginal_likelihood import log_evidence
 from lio_jax.estimation.motion_state import MotionState
+from lio_jax.estimation.sliding_window import log_evidence
 from lio_jax.estimation.smoother import Smoothed, smooth
 from tests.experiments import bench_path  # noqa: F401
 from tests.imu.motion import quick_jit

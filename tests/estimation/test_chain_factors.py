@@ -6,10 +6,15 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.estimation.imu_factor import imu_residual, predicted
+from lio_jax.estimation.factors import (
+    PoseMeasurement,
+    PositionMeasurement,
+    RelativePose,
+    imu_residual,
+    predicted,
+)
 from lio_jax.estimation.marginal_prior import gaussian_prior
 from lio_jax.estimation.motion_state import MotionState
-from lio_jax.estimation.pose_factors import PoseMeasurement, PositionMeasurement, RelativePose
 from lio_jax.estimation.pose_logarithm import log_and_jacobian
 from lio_jax.estimation.quadratic import robust_quadratic
 from lio_jax.imu.params import ImuParams

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, NOT_FINITE
-from lio_jax.estimation.pose_factors import fixed_information
+from lio_jax.estimation.factors import fixed_information
 from lio_jax.imu.preintegration import preintegrate_parallel
 from tests.estimation.smoothing import ROWS, smoothed
 
@@ -186,7 +186,7 @@ def test_optimistix_finds_the_same(recording, solution):
     import lineax
 
     from lio_jax.estimation.chain import information_of
-    from lio_jax.estimation.imu_factor import imu_residual
+    from lio_jax.estimation.factors import imu_residual
 
     size = 4
     chain = recording.chain.map_rows(lambda leaf: leaf[:size])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.status import CONVERGED
-from lio_jax.estimation.marginal_likelihood import log_evidence
+from lio_jax.estimation.sliding_window import log_evidence
 from lio_jax.estimation.smoother import smooth
 from lio_jax.imu.params import ImuParams
 from tests.experiments import bench_path  # noqa: F401

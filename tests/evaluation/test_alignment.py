@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.evaluation.alignment import align, position_errors
+from lio_jax.evaluation.trajectory_error import align, position_errors
 from tests.evaluation.scenes import straight_drive, transform, winding_drive
 
 MOVED = transform((0.2, -0.5, 1.5), (10.0, -4.0, 2.0))

@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.data.trajectory import Trajectory, read_kitti_poses
-from lio_jax.evaluation.alignment import align
-from lio_jax.evaluation.trajectory_error import absolute_error, relative_error
+from lio_jax.evaluation.trajectory_error import absolute_error, align, relative_error
 from tests.evaluation.scenes import stamped, straight_drive, transform, winding_drive
 from tests.shared_data import SHARED_DATA, needs_shared
 

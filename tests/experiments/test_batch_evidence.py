@@ -11,8 +11,8 @@ import pytest
 
 from lio_jax.core.error_state import BIASES, POSITION, ROTATION, VELOCITY, NavEstimate
 from lio_jax.core.types import ImuBatch, NavState
-from lio_jax.estimation.marginal_likelihood import log_evidence as evidence_of_chain
 from lio_jax.estimation.motion_state import MotionState
+from lio_jax.estimation.sliding_window import log_evidence as evidence_of_chain
 from lio_jax.estimation.smoother import smooth
 from lio_jax.imu.params import ImuParams
 from lio_jax.imu.sampling import sample_intervals

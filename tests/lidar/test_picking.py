@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.lidar.picking import Ring, pick, sector_bounds
-from lio_jax.lidar.smoothness import reach
+from lio_jax.lidar.picking import Ring, pick, reach, sector_bounds
 from tests.lidar.sequential import A_LOAM, LIO_SAM, Rule, pick_ring, sector_ends
 
 RINGS, PLACES = 8, 260

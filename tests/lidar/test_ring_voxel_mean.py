@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.lidar.ring_voxel_mean import mean_per_ring_and_voxel
+from lio_jax.lidar.thinning import mean_per_ring_and_voxel
 
 MEANS = jax.jit(mean_per_ring_and_voxel, static_argnums=4)
 SIZE = np.float32(0.2)

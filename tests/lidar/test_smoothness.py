@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.lidar.smoothness import (
+from lio_jax.lidar.picking import (
     occluded,
     parallel_to_beam,
     point_smoothness,

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from lio_jax.pose_graph.block_cholesky import factorise, order_of, plan_of, solve
-from lio_jax.pose_graph.elimination_tree import elimination_tree
-from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError
+from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError, elimination_tree
 
 CHAIN = [(k + 1, k) for k in range(59)]
 GRAPHS = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.leaf import numbers_of
-from lio_jax.loops.consistency import Consensus, consistent
+from lio_jax.loops.closing import Consensus, consistent
 from lio_jax.loops.proposals import Proposal
 from lio_jax.loops.verification import Verdict
 from lio_jax.settings.shared import GlobalParams

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lio_jax.loops.plan_view import SOURCE_REACH, fits, upright_cells
+from lio_jax.loops.verification import SOURCE_REACH, fits, upright_cells
 from tests.loops.places import pillars, pose, seen_from
 
 

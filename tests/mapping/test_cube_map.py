@@ -7,8 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.mapping.cube_map import added_to, matched_cubes
-from lio_jax.mapping.feature_map import FeaturePoints, empty_feature_map, frames_at
+from lio_jax.mapping.feature_map import (
+    FeaturePoints,
+    added_to_cubes,
+    empty_feature_map,
+    frames_at,
+    matched_cubes,
+)
 from lio_jax.mapping.point_map import EDGE
 from lio_jax.settings.settings import recipe_settings, with_overrides
 from tests.mapping.test_point_map import held
@@ -55,7 +60,7 @@ class Grid:
         self.points = self.points[inside]
 
 
-_add = jax.jit(partial(added_to, map_params=PARAMS.map, point_map=PARAMS.point_map, cubes=PARAMS.cubes))
+_add = jax.jit(partial(added_to_cubes, map_params=PARAMS.map, point_map=PARAMS.point_map, cubes=PARAMS.cubes))
 
 
 def added(cubes, points: np.ndarray, position: np.ndarray):

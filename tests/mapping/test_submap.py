@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from lio_jax.mapping.feature_map import FeaturePoints, empty_feature_map, frames_at
+from lio_jax.mapping.feature_map import FeaturePoints, Submap, empty_feature_map, frames_at, with_scan
 from lio_jax.mapping.keyframes import no_keyframes
 from lio_jax.mapping.nearest_points import nearest_points
-from lio_jax.mapping.submap import Submap, with_scan
 from lio_jax.settings.settings import recipe_settings
 
 PARAMS = recipe_settings("lio_sam").params()

@@ -13,7 +13,7 @@ from lio_jax.core.types import Scan
 from lio_jax.mapping.params import MapConfig
 from lio_jax.recipes.default import Default, State
 from lio_jax.recipes.default_params import ThinnedScanConfig
-from lio_jax.recipes.output import Output
+from lio_jax.recipes.recipe import Output
 from lio_jax.sim.assembly import assembled
 from lio_jax.sim.lidar import column_times, spinning_lidar, sweep
 from lio_jax.sim.worlds import Counts, World, nearest_part

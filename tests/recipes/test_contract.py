@@ -14,8 +14,7 @@ import pytest
 from lio_jax.core.status import LOST
 from lio_jax.core.xla import PerShape
 from lio_jax.recipes import RECIPES, recipe_named
-from lio_jax.recipes.output import Output
-from lio_jax.recipes.recipe import Recipe, State
+from lio_jax.recipes.recipe import Output, Recipe, State
 from lio_jax.settings.settings import Settings, recipe_of, recipe_settings, with_extrinsics, with_overrides
 from tests.params import DEFAULTS
 from tests.recipes.street import MOVING, SCANS, Driven, arrays, ate, recording

@@ -13,9 +13,8 @@ import pytest
 from lio_jax.core.status import CONVERGED, LOST
 from lio_jax.core.types import ImuBatch, Scan, initial_nav_state
 from lio_jax.lidar.features import FeatureCloud
-from lio_jax.mapping.feature_map import FeaturePoints, empty_feature_map
+from lio_jax.mapping.feature_map import FeaturePoints, Submap, empty_feature_map
 from lio_jax.mapping.keyframes import no_keyframes
-from lio_jax.mapping.submap import Submap
 from lio_jax.recipes import lio_sam_stages as stages
 from lio_jax.recipes.lio_sam_stages import Clock, Features, MapMatch, State
 from lio_jax.recipes.smoothed_odometry import opened

@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.point_map import EDGE, empty_map
 from lio_jax.mapping.voxel_map import anchor_of
-from lio_jax.registration.association import associated, no_association
 from lio_jax.registration.knn_planes import associate, fit_planes, linearise, no_planes
+from lio_jax.registration.scan_match import associated, no_association
 from lio_jax.settings.settings import recipe_settings, with_overrides
 from tests.mapping.test_nearest_points import street
 from tests.mapping.test_point_map import held, put

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.pose_covariance import adjoint_of
+from lio_jax.core.geometry import adjoint_of
 from lio_jax.run.keyframes import keyframe_indices, odometry_edges
 
 

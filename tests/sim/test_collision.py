@@ -10,7 +10,7 @@ from lio_jax.core.errors import UsageError
 from lio_jax.data.trajectory import Trajectory, pose_matrices
 from lio_jax.sim.assembly import Traffic, assembled, upright
 from lio_jax.sim.collision import CLEARANCE, STEP, check_clear
-from lio_jax.sim.room import SIZE, START
+from lio_jax.sim.open_worlds import SIZE, START
 from lio_jax.sim.sequence import SimulatedSequence
 
 DURATION = 10.0

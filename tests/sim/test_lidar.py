@@ -11,7 +11,7 @@ import pytest
 
 from lio_jax.sim.assembly import assembled
 from lio_jax.sim.lidar import firing_times_ns, ranging, spinning_lidar, sweep
-from lio_jax.sim.room import BALL, PILLAR, SIZE, START
+from lio_jax.sim.open_worlds import BALL, PILLAR, SIZE, START
 from lio_jax.sim.sensors import SENSORS
 from lio_jax.sim.sequence import EPOCH_NS, SimulatedSequence
 from lio_jax.sim.worlds import Counts, nearest_part

@@ -10,7 +10,7 @@ import pytest
 
 from lio_jax.recipes import RECIPES
 from lio_jax.run.track import Compiled, run_steps
-from lio_jax.settings.settings import recipe_of, recipe_settings
+from lio_jax.settings.settings import recipe_of
 from lio_jax.tuning.objectives import MarginalLikelihood, Observed
 from lio_jax.tuning.parameters import free_parameters
 from lio_jax.tuning.reverse import checkpointed_gradient

@@ -10,8 +10,7 @@ import pytest
 
 from lio_jax.cli import main
 from lio_jax.core.errors import LioJaxError, UsageError
-from lio_jax.viz.compare import write_comparison
-from lio_jax.viz.report import write_report
+from lio_jax.viz.report import write_comparison, write_report
 from lio_jax.viz.run_figures import map_png, nis_band
 from tests.viz.browser import needs_browser, opened
 from tests.viz.run_folders import write_run
