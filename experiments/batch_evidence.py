@@ -21,10 +21,9 @@ from lio_jax.core.geometry import rotation_matrix
 from lio_jax.estimation.block_tridiagonal import BlockTridiagonal, factorise, log_determinant, solve
 from lio_jax.estimation.chain import Chain
 from lio_jax.estimation.factors import imu_information, imu_residual
-from lio_jax.estimation.marginal_prior import LOG_2PI
+from lio_jax.estimation.marginal_prior import LOG_2PI, Quadratic
 from lio_jax.estimation.motion_state import DOF, POSE_DOF, MotionState, local_jacobian
 from lio_jax.estimation.pose_logarithm import log_and_jacobian
-from lio_jax.estimation.quadratic import Quadratic
 from lio_jax.imu.discretise import discretise, process_noise
 from lio_jax.imu.params import ImuParams
 from lio_jax.imu.preintegration import NAV_DOF, accumulate, nav_transition, sensitivity

@@ -14,8 +14,8 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional, arg
 
+from lio_jax.commands.runtime import usage_in_a_sentence
 from lio_jax.commands.sim_options import ErrorOptions, Format, MotionOptions, SensorOptions
-from lio_jax.commands.usage import usage_in_a_sentence
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.tuning.objective_names import EXAMPLE, LISTED
 

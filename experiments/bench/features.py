@@ -103,7 +103,8 @@ def _programs(scan: "LidarScan", sizes: tuple[int, int, int]) -> dict[str, dict[
             "features": partial(to_features, config),
         }
         programs[recipe] = {
-            name: partial(jax.jit(stage), params, scan_on_device) for name, stage in stages.items()
+            name: partial(jax.jit(stage), params.lidar if name == "image" else params, scan_on_device)
+            for name, stage in stages.items()
         }
     return programs
 

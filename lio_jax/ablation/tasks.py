@@ -12,13 +12,14 @@ from typing import Any
 from lio_jax.ablation.sources import Source, key_of
 from lio_jax.ablation.spec import Spec
 from lio_jax.ablation.variants import Variant
+from lio_jax.recipes import source_hash
 from lio_jax.settings.settings import Settings
 
 _FORMAT = 1
 """Version of the files that a task leaves; another number runs everything again."""
 _CODE = (
-    *("core", "imu", "lidar", "mapping", "registration", "estimation", "loops"),
-    *("recipes", "data", "sim", "run", "evaluation"),
+    *("core", "imu", "lidar", "mapping", "pose_graph", "registration", "estimation", "loops"),
+    *("recipes", "data", "sim", "settings", "run", "evaluation"),
 )
 """Packages of the code that a run's result depends on."""
 
@@ -60,6 +61,7 @@ def tasks_of(spec: Spec) -> list[Task]:
                 variant.settings.as_dict(),
                 sorted(variant.settings.given),
                 code_version(),
+                source_hash(variant.settings.recipe),
             ]
             key = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:20]
             tasks.append(Task(source, variant, spec.keep, spec.batch, key, source_key))

@@ -83,8 +83,11 @@ def _settings(recipe: str, overrides: Overrides, folder: Path, place: str) -> Se
         beside = folder / chosen
         settings = load_settings(beside if beside.exists() else Path(chosen))
     else:
-        recipe_named(chosen)
-        settings = recipe_settings(chosen)
+        own = folder / chosen
+        # a recipe in a file is looked for next to the specification first
+        settings = recipe_settings(
+            str(own) if own.with_name(own.name.rpartition(":")[0]).is_file() else chosen
+        )
     for path, value in overrides.items():
         if path != "recipe":
             settings = settings.with_value(path, value, place)

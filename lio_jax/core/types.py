@@ -1,8 +1,4 @@
-"""Device-side types: padded arrays with a mask, as equinox pytrees.
-
-Frames: ``T_a_b`` maps coordinates from b to a. Absolute time never reaches the device: all times here are in
-seconds from the start of the scan, and the host keeps int64 nanoseconds.
-"""
+"""Types that every floor shares: pytrees of scans, samples and states, and the status codes of solves."""
 
 import equinox as eqx
 import jax
@@ -92,3 +88,15 @@ def initial_nav_state(T_imu_lidar: jaxlie.SE3, gravity_magnitude: float = 9.8066
 def state_dtype() -> jnp.dtype:
     """Return the dtype of navigation states and covariances: float64 in JAX's x64 mode, otherwise float32."""
     return jax.dtypes.canonicalize_dtype(jnp.float64)
+
+
+CONVERGED = 0
+"""Status of a solve that converged. Scan matches, the filter and the smoother share these codes."""
+ITERATION_LIMIT = 1
+"""Status of a solve that did not converge: the last iterate was kept; derivatives there are not to be
+trusted."""
+LOST = 2
+"""Status where the measurement could not be used, for example a scan with too few matches: the result is the
+prediction."""
+NOT_FINITE = 3
+"""Status where numbers overflowed: the result is the prediction, or the last states that were finite."""

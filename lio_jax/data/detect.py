@@ -5,8 +5,7 @@ from pathlib import Path
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data import kitti, kitti_raw, native, rosbag
 from lio_jax.data.config import DataConfig
-from lio_jax.data.reader import Reader, entries
-from lio_jax.data.sequence import Sequence
+from lio_jax.data.sequence import Reader, Sequence, entries
 
 READERS = (kitti.READER, kitti_raw.READER, native.READER, rosbag.READER)
 """All readers; the first one that recognises a path opens it. A new format is a module and an entry here."""

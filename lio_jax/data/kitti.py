@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.timestamps import seconds_to_ns
 from lio_jax.data.config import DataConfig
-from lio_jax.data.reader import Reader
 from lio_jax.data.reconstruct import KITTI_START_AZIMUTH, azimuth_time
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo, WarningLog
+from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
 from lio_jax.data.time_order import Stamped, ascending, in_time_order
 from lio_jax.data.trajectory import Trajectory, read_kitti_poses
 from lio_jax.data.velodyne_file import (

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data.config import DataConfig
 from lio_jax.data.enu import geodetic_to_enu, mercator_positions
-from lio_jax.data.reader import Reader
 from lio_jax.data.reconstruct import KITTI_START_AZIMUTH, azimuth_time
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo, WarningLog
+from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
 from lio_jax.data.time_order import Stamped, ascending, in_time_order
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.data.velodyne_file import (

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data.config import DataConfig
 from lio_jax.data.pointcloud2 import valid_returns
-from lio_jax.data.reader import Reader
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo, WarningLog
+from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
 from lio_jax.data.time_order import Stamped, in_time_order
 from lio_jax.data.trajectory import Trajectory, read_tum
 from lio_jax.data.velodyne_file import listed, missing_numbers, numbered_files

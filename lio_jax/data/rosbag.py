@@ -27,8 +27,7 @@ from lio_jax.data.bag_scans import decode_cloud, recognise_scans
 from lio_jax.data.config import DataConfig
 from lio_jax.data.imu_checks import accel_scale
 from lio_jax.data.navigation_messages import GpsCollector, ImuCollector
-from lio_jax.data.reader import Reader, entries
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo, WarningLog
+from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog, entries
 from lio_jax.data.static_transforms import frame_name, gathered, transform_between
 from lio_jax.data.time_order import Stamped, in_time_order
 from lio_jax.data.trajectory import Trajectory

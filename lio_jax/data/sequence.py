@@ -1,14 +1,18 @@
-"""What a recording is: one protocol for all formats, and scans decoded ahead on a thread."""
+"""What a recording is, one protocol for all formats; what a reader is; and scans decoded ahead on a
+thread."""
 
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lio_jax.core.errors import LioJaxError
+from lio_jax.data.config import DataConfig
 from lio_jax.data.trajectory import Trajectory
 
 
@@ -191,3 +195,31 @@ def _discard(ready: "queue.Queue[T | _End]") -> None:
             ready.get_nowait()
     except queue.Empty:
         pass
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One format of recordings."""
+
+    name: str
+    """As it stands in ``SequenceInfo.format``."""
+    called: str
+    """In messages, with what it is recognised by: "a native folder (meta.yaml and scans/)"."""
+    recognises: Callable[[Path], bool]
+    """Whether an existing path looks like such a recording."""
+    open: Callable[[Path, DataConfig], Sequence]
+    """Opens it; raises LioJaxError where it is broken."""
+    has_parts: bool = True
+    """Whether the paths inside such a recording are parts of it and no recordings themselves."""
+
+
+def entries(folder: Path) -> list[Path]:
+    """Return what lies in a folder, in order, hidden files left out.
+
+    Raises:
+        LioJaxError: the folder cannot be listed.
+    """
+    try:
+        return sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    except OSError as error:
+        raise LioJaxError(f"{folder}: cannot be listed ({error.strerror}); check its permissions.") from None

@@ -16,9 +16,8 @@ from lio_jax.estimation.factors import (
     imu_information,
     imu_quadratic,
 )
-from lio_jax.estimation.marginal_prior import Prior
+from lio_jax.estimation.marginal_prior import Prior, Quadratic
 from lio_jax.estimation.motion_state import DOF, POSE_DOF, MotionState
-from lio_jax.estimation.quadratic import Quadratic
 from lio_jax.imu.preintegration import Preintegrated
 
 

@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, Float
 from lio_jax.core.error_state import POSITION, ROTATION, VELOCITY
 from lio_jax.core.geometry import adjoint, rotation_matrix, skew
 from lio_jax.core.types import NavState
+from lio_jax.estimation.marginal_prior import Quadratic, quadratic, robust_quadratic
 from lio_jax.estimation.motion_state import POSE_DOF, MotionState
 from lio_jax.estimation.pose_logarithm import log_and_jacobian, right_jacobian
-from lio_jax.estimation.quadratic import Quadratic, quadratic, robust_quadratic
 from lio_jax.imu.preintegration import Preintegrated, predict
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.implicit import Problem, Solution, implicit
-from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, LOST, NOT_FINITE
+from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, LOST, NOT_FINITE
 from lio_jax.estimation.innovation import Innovation, innovation_of, square_root_information
 
 State = TypeVar("State")
@@ -45,7 +45,7 @@ class Update(NamedTuple):
     """The last linearisation, at the iterate before ``state``."""
     iterations: Int32[Array, ""]
     status: Int32[Array, ""]
-    """See :mod:`lio_jax.core.status`; after LOST and NOT_FINITE state and covariance are the prior's."""
+    """See :mod:`lio_jax.core.types`; after LOST and NOT_FINITE state and covariance are the prior's."""
 
 
 def iterated_update(

@@ -19,9 +19,8 @@ from lio_jax.estimation.factors import (
     predicted,
 )
 from lio_jax.estimation.innovation import square_root_information
-from lio_jax.estimation.marginal_prior import LOG_2PI, Prior, marginalised
+from lio_jax.estimation.marginal_prior import LOG_2PI, Prior, Quadratic, marginalised
 from lio_jax.estimation.motion_state import DOF, MotionState
-from lio_jax.estimation.quadratic import Quadratic
 from lio_jax.estimation.smoother import Smoothed, smooth
 from lio_jax.imu.preintegration import Preintegrated
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.implicit import Problem, Solution, implicit
-from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, NOT_FINITE
+from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, NOT_FINITE
 from lio_jax.estimation.block_tridiagonal import BlockTridiagonal, factorise, inverse_blocks, solve
 from lio_jax.estimation.chain import Chain, Normal, information_of, linearise
 from lio_jax.estimation.motion_state import DOF, MotionState

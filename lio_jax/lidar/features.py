@@ -19,7 +19,13 @@ from jaxtyping import Array, Bool, Float, Float32, Int32
 from lio_jax.core.errors import UsageError
 from lio_jax.core.types import Scan
 from lio_jax.core.xla import computed_once
-from lio_jax.lidar.params import Config, Params
+from lio_jax.lidar.params import (
+    ReadsFeatures,
+    ReadsLioSamFeatures,
+    ReadsLoamFeatures,
+    ReadsLoamRings,
+    ReadsRings,
+)
 from lio_jax.lidar.picking import (
     Picks,
     Ring,
@@ -90,7 +96,7 @@ class Rings(eqx.Module):
     """Place along each ring where each sector starts, and where the last one ends."""
 
 
-def check_sizes(config: Config) -> None:
+def check_sizes(config: ReadsRings) -> None:
     """Check that no size of ``config.features`` is left to be chosen from the recording.
 
     Raises:
@@ -104,7 +110,7 @@ def check_sizes(config: Config) -> None:
         )
 
 
-def loam_features(config: Config, params: Params, scan: Scan) -> LoamFeatures:
+def loam_features(config: ReadsLoamRings, params: ReadsLoamFeatures, scan: Scan) -> LoamFeatures:
     """Pick LOAM's features.
 
     Source: Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014, section V.A, in the form
@@ -127,7 +133,7 @@ def loam_features(config: Config, params: Params, scan: Scan) -> LoamFeatures:
     )
 
 
-def lio_sam_features(config: Config, params: Params, scan: Scan) -> LioSamFeatures:
+def lio_sam_features(config: ReadsRings, params: ReadsLioSamFeatures, scan: Scan) -> LioSamFeatures:
     """Pick LIO-SAM's features.
 
     Source: Shan et al., "LIO-SAM: Tightly-coupled lidar inertial odometry via smoothing and mapping", IROS
@@ -147,7 +153,7 @@ def lio_sam_features(config: Config, params: Params, scan: Scan) -> LioSamFeatur
     )
 
 
-def loam_rings(config: Config, params: Params, scan: Scan) -> Rings:
+def loam_rings(config: ReadsRings, params: ReadsLoamFeatures, scan: Scan) -> Rings:
     """Return the scan's rings with the smoothness of the points in 3-D; every point may be picked.
 
     Suppression ends where consecutive points are farther apart than ``connected_distance``. This replaces the
@@ -166,7 +172,7 @@ def loam_rings(config: Config, params: Params, scan: Scan) -> Rings:
         return _measured(config, image, xyz, time, smoothness, image.mask, connected)
 
 
-def lio_sam_rings(config: Config, params: Params, scan: Scan) -> Rings:
+def lio_sam_rings(config: ReadsRings, params: ReadsLioSamFeatures, scan: Scan) -> Rings:
     """Return the scan's rings with the smoothness of the ranges, without occluded and grazing points.
 
     Args:
@@ -195,11 +201,11 @@ def lio_sam_rings(config: Config, params: Params, scan: Scan) -> Rings:
 
 
 def _gathered(
-    config: Config, params: Params, scan: Scan
+    config: ReadsRings, params: ReadsFeatures, scan: Scan
 ) -> tuple[RangeImage, tuple[Array, Array, Array], Array]:
     """Return the range image, the coordinates x, y and z along its rings (m), and the times (s)."""
     with jax.named_scope("range_image"):
-        image = range_image(config.features, params, scan)
+        image = range_image(config.features, params.lidar, scan)
         x, y, z, time = (
             jnp.where(image.mask, values.at[image.index].get(mode="clip"), 0.0)
             for values in (*(scan.points[:, axis] for axis in range(3)), scan.time)
@@ -209,7 +215,7 @@ def _gathered(
 
 
 def _measured(
-    config: Config,
+    config: ReadsRings,
     image: RangeImage,
     xyz: tuple[Array, Array, Array],
     time: Float32[Array, "k rings"],
@@ -223,7 +229,7 @@ def _measured(
     return Rings(image, xyz, time, ring, sector_bounds(image.count, settings.sectors, settings.neighbours))
 
 
-def _picked(config: Config, params: Params, rings: Rings, flats: int | None) -> Picks:
+def _picked(config: ReadsRings, params: ReadsFeatures, rings: Rings, flats: int | None) -> Picks:
     with jax.named_scope("pick"):
         return pick(
             rings.ring,
@@ -249,7 +255,7 @@ def _cloud(scan: Scan, rings: Rings, places: Int32[Array, "c sectors rings"]) ->
 
 
 def _surface(
-    config: Config, params: Params, rings: Rings, picks: Picks
+    config: ReadsRings, params: ReadsFeatures, rings: Rings, picks: Picks
 ) -> tuple[FeatureCloud, Int32[Array, ""]]:
     """Return the mean per ring and voxel of the sectors' points that are no corners, and the dropped rows."""
     k, count = rings.time.shape
@@ -267,10 +273,12 @@ def _surface(
 
 
 _Features = TypeVar("_Features")
+_Rings = TypeVar("_Rings", bound=ReadsRings)
+_Params = TypeVar("_Params", bound=ReadsFeatures)
 
 
 def in_single_precision(
-    pick: Callable[[Config, Params, Scan], _Features], config: Config, params: Params, scan: Scan
+    pick: Callable[[_Rings, _Params, Scan], _Features], config: _Rings, params: _Params, scan: Scan
 ) -> _Features:
     """Pick features in single precision, and return them in the scan's dtype: the choice has no derivative.
 
@@ -289,7 +297,11 @@ def in_single_precision(
 
 
 def thinned_features(
-    corner: FeatureCloud, surface: FeatureCloud, params: Params, corners: int, surfaces: int
+    corner: FeatureCloud,
+    surface: FeatureCloud,
+    voxel_sizes: tuple[Float[Array, ""], Float[Array, ""]],
+    corners: int,
+    surfaces: int,
 ) -> tuple[FeatureCloud, FeatureCloud, Int32[Array, ""]]:
     """Return the means of corners and of surface points per voxel of the map, and how many were dropped.
 
@@ -299,11 +311,12 @@ def thinned_features(
     Args:
         corner: corners of a scan.
         surface: surface points of a scan.
-        params: ``map.corner_voxel_size`` and ``map.voxel_size``.
+        voxel_sizes: of the map of corners and of the map of surface points, m.
         corners: capacity for corners.
         surfaces: capacity for surface points.
     """
-    kinds = ((corner, params.map.corner_voxel_size, corners), (surface, params.map.voxel_size, surfaces))
+    corner_size, surface_size = voxel_sizes
+    kinds = ((corner, corner_size, corners), (surface, surface_size, surfaces))
     clouds, dropped = [], jnp.int32(0)
     for cloud, size, capacity in kinds:
         mean = mean_per_voxel(cloud.points, cloud.mask, size.astype(jnp.float32), capacity, cloud.time)

@@ -1,7 +1,7 @@
 """Parameters of the LiDAR's measurements, of scan sizes and of features along rings."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import equinox as eqx
 
@@ -109,5 +109,56 @@ class LoamRingConfig(RingConfig):
     """Number of flattest points of a sector, which are matched against the surfaces."""
 
 
-Params = Any
-Config = Any
+@runtime_checkable
+class ReadsFeatures(Protocol):
+    """A recipe's parameters, as far as the features of any kind read them."""
+
+    @property
+    def lidar(self) -> LidarParams:
+        """The range measurement."""
+        ...
+
+    @property
+    def features(self) -> FeatureParams:
+        """Which points are corners and which are flat."""
+        ...
+
+
+@runtime_checkable
+class ReadsLoamFeatures(ReadsFeatures, Protocol):
+    """A recipe's parameters, as far as A-LOAM's features read them."""
+
+    @property
+    def features(self) -> LoamFeatureParams:
+        """Which points are corners and which are flat."""
+        ...
+
+
+@runtime_checkable
+class ReadsLioSamFeatures(ReadsFeatures, Protocol):
+    """A recipe's parameters, as far as LIO-SAM's features read them."""
+
+    @property
+    def features(self) -> LioSamFeatureParams:
+        """Which points are corners and which are flat."""
+        ...
+
+
+@runtime_checkable
+class ReadsRings(Protocol):
+    """A recipe's static settings, as far as the features read them."""
+
+    @property
+    def features(self) -> RingConfig:
+        """Sizes of the rings and of the features along them."""
+        ...
+
+
+@runtime_checkable
+class ReadsLoamRings(ReadsRings, Protocol):
+    """A recipe's static settings, as far as A-LOAM's features read them."""
+
+    @property
+    def features(self) -> LoamRingConfig:
+        """Sizes of the rings and of the features along them."""
+        ...

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float32, Int32
 
 from lio_jax.core.prefix_sum import counts_before
 from lio_jax.core.types import Scan
-from lio_jax.lidar.params import Params, RingConfig
+from lio_jax.lidar.params import LidarParams, RingConfig
 
 
 class RangeImage(eqx.Module):
@@ -34,7 +34,7 @@ class RangeImage(eqx.Module):
         return jnp.arange(self.index.shape[0], dtype=jnp.int32)[:, None] < self.count
 
 
-def range_image(config: RingConfig, params: Params, scan: Scan) -> RangeImage:
+def range_image(config: RingConfig, lidar: LidarParams, scan: Scan) -> RangeImage:
     """Sort a scan's points into rings.
 
     With ``order="azimuth"`` (LIO-SAM) a column keeps the first point that falls into it, and later points are
@@ -48,7 +48,7 @@ def range_image(config: RingConfig, params: Params, scan: Scan) -> RangeImage:
     """
     x, y, z = (scan.points[:, axis] for axis in range(3))
     squared_range = x**2 + y**2 + z**2
-    near, far = params.lidar.min_range.astype(jnp.float32), params.lidar.max_range.astype(jnp.float32)
+    near, far = lidar.min_range.astype(jnp.float32), lidar.max_range.astype(jnp.float32)
     wanted = scan.mask & (squared_range > near**2) & (squared_range < far**2)
     wanted &= scan.ring >= 0
     if config.ring_step > 1:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from lio_jax.core.types import Scan
-from lio_jax.lidar.params import Params
+from lio_jax.lidar.params import LidarParams
 
 _APART = (1e-5, 0.025)
 """Smallest and largest angle between neighbours of a ring, rad. Closer returns belong to one pulse; between
@@ -28,7 +28,7 @@ class RangeScatter(eqx.Module):
     """True where all three returns are usable neighbours."""
 
 
-def range_scatter(scan: Scan, params: Params) -> RangeScatter:
+def range_scatter(scan: Scan, lidar: LidarParams) -> RangeScatter:
     """Return the range residuals of every third return of each ring.
 
     On a plane the inverse range is linear in the beam's direction, so the ranges of two neighbours predict
@@ -36,9 +36,8 @@ def range_scatter(scan: Scan, params: Params) -> RangeScatter:
 
     Args:
         scan: padded sweep; the returns of each ring are in the order in which they were taken.
-        params: ``lidar.min_range`` and ``lidar.max_range`` bound the returns that count.
+        lidar: ``min_range`` and ``max_range`` bound the returns that count.
     """
-    lidar = params.lidar
     distance = jnp.linalg.norm(scan.points, axis=-1)
     usable = scan.mask & (distance > lidar.min_range) & (distance < lidar.max_range)
     ring = jnp.where(usable, scan.ring, jnp.iinfo(scan.ring.dtype).max)

@@ -9,7 +9,7 @@ from lio_jax.core.hashing import voxel_hash
 from lio_jax.core.prefix_sum import counts_before, running_count
 from lio_jax.core.types import Scan
 from lio_jax.core.xla import computed_once
-from lio_jax.lidar.params import Params
+from lio_jax.lidar.params import LidarParams
 
 
 class Selection(eqx.Module):
@@ -87,8 +87,9 @@ class ThinnedScan(eqx.Module):
 
 
 def thinned(
-    params: Params,
+    lidar: LidarParams,
     scan: Scan,
+    map_spacing: Float[Array, ""],
     registration_spacing: Float[Array, ""],
     insertion_points: int,
     registration_points: int,
@@ -96,16 +97,17 @@ def thinned(
     """Return the scan within its range limits, thinned to the spacings of map and registration.
 
     Args:
-        params: ``lidar.min_range``, ``lidar.max_range`` and ``map.point_spacing``.
+        lidar: ``min_range`` and ``max_range``.
         scan: padded sweep.
+        map_spacing: edge of the voxels from which one point enters the map, m.
         registration_spacing: edge of the voxels from which one point is matched, m.
         insertion_points: capacity for the points of the map.
         registration_points: capacity for the points to match.
     """
     squared_range = jnp.sum(scan.points**2, -1)
-    near, far = params.lidar.min_range.astype(jnp.float32), params.lidar.max_range.astype(jnp.float32)
+    near, far = lidar.min_range.astype(jnp.float32), lidar.max_range.astype(jnp.float32)
     mask = scan.mask & (squared_range > near**2) & (squared_range < far**2)
-    chosen = select_per_voxel(scan.points, mask, params.map.point_spacing, insertion_points)
+    chosen = select_per_voxel(scan.points, mask, map_spacing, insertion_points)
     # a value that is not finite in an empty row would make the derivatives of masked sums NaN
     points = jnp.where(chosen.mask[:, None], scan.points[chosen.index], 0.0)
     matched = select_per_voxel(points, chosen.mask, registration_spacing, registration_points)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32
 from numpy.typing import NDArray
 
-from lio_jax.core.status import CONVERGED
+from lio_jax.core.types import CONVERGED
 from lio_jax.loops.params import AlignmentParams
 from lio_jax.mapping.voxel_map import VoxelMap, empty_map, insert
 from lio_jax.pose_graph.graph import poses_from, rotation_matrices

@@ -17,8 +17,7 @@ from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.error_state import NavEstimate
 from lio_jax.core.leaf import section, static
-from lio_jax.core.status import ITERATION_LIMIT
-from lio_jax.core.types import ImuBatch, NavState, Scan
+from lio_jax.core.types import ITERATION_LIMIT, ImuBatch, NavState, Scan
 from lio_jax.imu.params import ImuParams, InitialParams
 from lio_jax.imu.path import deskew_along
 from lio_jax.lidar.params import LidarParams, ScanConfig

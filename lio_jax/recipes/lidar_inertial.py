@@ -12,8 +12,7 @@ from jaxtyping import Array, Float, Int32
 
 from lio_jax.core.error_state import NavEstimate
 from lio_jax.core.implicit import with_derivative_of
-from lio_jax.core.status import ITERATION_LIMIT
-from lio_jax.core.types import ImuBatch, NavState, Scan
+from lio_jax.core.types import ITERATION_LIMIT, ImuBatch, NavState, Scan
 from lio_jax.estimation.map_drift import MapDrift
 from lio_jax.imu.path import Path, deskew_along
 from lio_jax.lidar.thinning import ThinnedScan, thinned
@@ -90,7 +89,8 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
     """
     first = state.scans == 0
     spacing = params.registration.inertial_point_spacing
-    thin = thinned(params, scan, spacing, config.imu.insertion_points, config.imu.registration_points)
+    sizes = config.imu.insertion_points, config.imu.registration_points
+    thin = thinned(params.lidar, scan, params.map.point_spacing, spacing, *sizes)
     with jax.named_scope("predict"):
         prior, path = predicted(params, state.estimate, scan, imu, first)
         T_predicted = lidar_pose(prior.nav)

@@ -9,16 +9,14 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int32
 
-from lio_jax.core.status import LOST
-from lio_jax.core.types import NavState, Scan, initial_nav_state
-from lio_jax.lidar.deskew import deskew_constant_velocity
+from lio_jax.core.types import LOST, NavState, Scan, initial_nav_state
+from lio_jax.lidar.deskew import TrialMotion, deskew_constant_velocity
 from lio_jax.lidar.thinning import thinned
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
 from lio_jax.recipes import recipe
 from lio_jax.recipes.default_params import Config, Params
 from lio_jax.recipes.recipe import Output
-from lio_jax.recipes.trial_motion import TrialMotion
 from lio_jax.registration.gauss_newton import gauss_newton
 from lio_jax.registration.voxel_planes import ScanToVoxels
 
@@ -79,7 +77,8 @@ def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[Stat
     """
     with jax.named_scope("thin"):
         spacing = params.registration.point_spacing
-        thin = thinned(params, scan, spacing, config.lidar.insertion_points, config.lidar.registration_points)
+        sizes = config.lidar.insertion_points, config.lidar.registration_points
+        thin = thinned(params.lidar, scan, params.map.point_spacing, spacing, *sizes)
     with jax.named_scope("predict"):
         first, T_last = state.scans == 0, state.T_world_lidar
         motion = TrialMotion.since(state.twist, state.mid_to_end, scan, first)

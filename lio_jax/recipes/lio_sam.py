@@ -21,8 +21,7 @@ from jaxtyping import Array, Float
 from lio_jax.core.error_state import DOF as NAV_DOF
 from lio_jax.core.errors import UsageError
 from lio_jax.core.geometry import from_blocks
-from lio_jax.core.status import CONVERGED, ITERATION_LIMIT
-from lio_jax.core.types import ImuBatch, NavState, Scan, state_dtype
+from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, ImuBatch, NavState, Scan, state_dtype
 from lio_jax.estimation.motion_state import DOF
 from lio_jax.estimation.sliding_window import Window, log_evidence
 from lio_jax.estimation.smoother import Smoothed

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.status import LOST
-from lio_jax.core.types import ImuBatch, NavState, Scan, state_dtype
+from lio_jax.core.types import LOST, ImuBatch, NavState, Scan, state_dtype
 from lio_jax.estimation.chain import information_of, linearise
 from lio_jax.estimation.sliding_window import Added, Window, append_and_update
 from lio_jax.estimation.smoother import Smoothed
@@ -123,7 +122,8 @@ def picked_features(config: Config, params: Params, scan: Scan, first: Bool[Arra
     """
     features = in_single_precision(lio_sam_features, config, params, scan)
     room = config.lio_sam.corner_points, config.lio_sam.surface_points
-    corner, surface, thinned_away = thinned_features(features.corner, features.surface, params, *room)
+    voxel_sizes = params.map.corner_voxel_size, params.map.voxel_size
+    corner, surface, thinned_away = thinned_features(features.corner, features.surface, voxel_sizes, *room)
     least = params.submap.min_corners, params.submap.min_surfaces
     enough = (jnp.sum(corner.mask) >= least[0]) & (jnp.sum(surface.mask) >= least[1])
     # a first scan that is too poor would be a map in which nothing is ever found

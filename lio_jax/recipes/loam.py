@@ -18,8 +18,8 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.leaf import section, static
-from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, LOST
-from lio_jax.core.types import ImuBatch, NavState, Scan, initial_nav_state
+from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, LOST, ImuBatch, NavState, Scan, initial_nav_state
+from lio_jax.lidar.deskew import TrialMotion
 from lio_jax.lidar.features import (
     FeatureCloud,
     LoamFeatures,
@@ -41,7 +41,6 @@ from lio_jax.mapping.params import CubeGridParams, FeatureMapParams, MapConfig, 
 from lio_jax.recipes import recipe
 from lio_jax.recipes.params import RecipeConfig, RecipeParams
 from lio_jax.recipes.recipe import Needs, Output, Recipe
-from lio_jax.recipes.trial_motion import TrialMotion
 from lio_jax.registration.feature_match import ScanToCubes
 from lio_jax.registration.gauss_newton import Registration, gauss_newton
 from lio_jax.registration.params import (
@@ -217,8 +216,9 @@ class Loam(Recipe[Config, Params, State]):
             twist = motion.twist_to(odometry.T_world_lidar)
         with jax.named_scope("scan_to_map"):
             room = config.loam.corner_points, config.loam.surface_points
+            voxel_sizes = params.map.corner_voxel_size, params.map.voxel_size
             corner, surface, thinned_away = thinned_features(
-                features.less_sharp, features.less_flat, params, *room
+                features.less_sharp, features.less_flat, voxel_sizes, *room
             )
             thin = _Compensated(corner, surface, motion, config.loam.compensate)(odometry.T_world_lidar)
             guess = state.T_map_odom @ T_odom_lidar

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.geometry import rotation_matrix
 from lio_jax.core.implicit import Problem, Solution, implicit
-from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, LOST
+from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, LOST
 from lio_jax.registration.params import GaussNewtonMatch, RegistrationParams
 from lio_jax.registration.scan_match import Association, NormalEquations, ScanMatch
 

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, NOT_FINITE
-from lio_jax.core.types import ImuBatch
+from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, NOT_FINITE, ImuBatch
 from lio_jax.imu.sampling import LONGEST_GAP
 from lio_jax.settings.settings import Settings
 

@@ -37,7 +37,7 @@ class Observed(eqx.Module):
     rmse: Float[Array, ""]
     """Robustly weighted root mean square distance of the scan to the map, m."""
     status: Int32[Array, ""]
-    """Of the solve, see :mod:`lio_jax.core.status`."""
+    """Of the solve, see :mod:`lio_jax.core.types`."""
     lost: Bool[Array, ""]
     covariance: Float[Array, "24 24"] | None
     """Of the navigation state; None from recipes that carry none."""
@@ -225,7 +225,7 @@ def range_noise(seen: Observed, truth: TruePose) -> Float[Array, ""]:
         raise UsageError(
             "the objective ranges wants the scan and the parameters beside what a step left to see."
         )
-    scatter = range_scatter(scan, params)
+    scatter = range_scatter(scan, params.lidar)
     ranges = (params.lidar.range_sigma * scatter.spread) ** 2
     if isinstance(params.lidar, BeamParams):
         ranges = ranges + (params.lidar.angle_sigma * scatter.slope) ** 2

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from lio_jax.core.status import ITERATION_LIMIT, NOT_FINITE
-from lio_jax.core.types import Scan
+from lio_jax.core.types import ITERATION_LIMIT, NOT_FINITE, Scan
 from lio_jax.core.xla import programs
 from lio_jax.recipes.params import RecipeParams as Params
 from lio_jax.recipes.transforms import Dual, RecipeLike, batched, push_forward, with_tangents

@@ -9,7 +9,7 @@ import tyro
 from tyro.conf import arg
 
 from lio_jax.cli import main
-from lio_jax.commands.usage import usage_in_a_sentence
+from lio_jax.commands.runtime import usage_in_a_sentence
 from lio_jax.core.errors import UsageError
 
 WRONG = {

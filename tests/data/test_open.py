@@ -6,7 +6,7 @@ import pytest
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data import detect, native, open_sequence, write_native
 from lio_jax.data.config import DataConfig
-from lio_jax.data.reader import Reader
+from lio_jax.data.sequence import Reader
 from tests.data.test_native import scans
 from tests.shared_data import SHARED_DATA, needs_shared
 

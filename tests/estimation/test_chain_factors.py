@@ -13,10 +13,9 @@ from lio_jax.estimation.factors import (
     imu_residual,
     predicted,
 )
-from lio_jax.estimation.marginal_prior import gaussian_prior
+from lio_jax.estimation.marginal_prior import gaussian_prior, robust_quadratic
 from lio_jax.estimation.motion_state import MotionState
 from lio_jax.estimation.pose_logarithm import log_and_jacobian
-from lio_jax.estimation.quadratic import robust_quadratic
 from lio_jax.imu.params import ImuParams
 from tests.estimation.smoothing import ROWS
 from tests.imu.motion import quick_jit

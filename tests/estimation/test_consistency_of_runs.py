@@ -17,7 +17,7 @@ from lio_jax.core.error_state import (
     TIME_OFFSET,
     VELOCITY,
 )
-from lio_jax.core.status import CONVERGED
+from lio_jax.core.types import CONVERGED
 from lio_jax.evaluation.consistency import average_band, nees
 from tests.estimation import wave
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.status import CONVERGED
+from lio_jax.core.types import CONVERGED
 from lio_jax.estimation.sliding_window import Added, append_and_update, open_window
 from tests.estimation.linear_chain import GRAVITY, linear_chain, log_likelihood, row_of
 from tests.estimation.smoothing import ROWS, evidence_of, smoothed

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, LOST, NOT_FINITE
+from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, LOST, NOT_FINITE
 from lio_jax.estimation.iterated_filter import Measurement, Update, iterated_update
 
 

@@ -20,8 +20,7 @@ from lio_jax.core.error_state import (
     local,
     retract,
 )
-from lio_jax.core.status import CONVERGED
-from lio_jax.core.types import NavState
+from lio_jax.core.types import CONVERGED, NavState
 from lio_jax.estimation.iterated_filter import Measurement, Update
 from lio_jax.estimation.nav_update import reset_jacobian, update_nav
 from lio_jax.estimation.pose_measurement import measured_pose

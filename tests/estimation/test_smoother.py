@@ -9,7 +9,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, NOT_FINITE
+from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, NOT_FINITE
 from lio_jax.estimation.factors import fixed_information
 from lio_jax.imu.preintegration import preintegrate_parallel
 from tests.estimation.smoothing import ROWS, smoothed

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from lio_jax.core.status import CONVERGED
+from lio_jax.core.types import CONVERGED
 from lio_jax.estimation.sliding_window import Added, append_and_update, open_window
 from tests.estimation.smoothing import ROWS, smoothed
 from tests.imu.motion import quick_jit

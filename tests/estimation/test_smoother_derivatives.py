@@ -7,7 +7,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.core.status import CONVERGED
+from lio_jax.core.types import CONVERGED
 from lio_jax.estimation.sliding_window import log_evidence
 from lio_jax.estimation.smoother import smooth
 from lio_jax.imu.params import ImuParams

@@ -34,7 +34,7 @@ def rings_of(image) -> list[list[int]]:
 @pytest.mark.parametrize("seed", range(4))
 def test_rings_hold_their_points_in_order_of_arrival(seed, order):
     scan = random_scan(seed, order=order)
-    image = IMAGE(LoamRingConfig(rings=8, columns=500), LOAM_PARAMS, scan)
+    image = IMAGE(LoamRingConfig(rings=8, columns=500), LOAM_PARAMS.lidar, scan)
     kept, ring = kept_points(scan), np.asarray(scan.ring)
     assert rings_of(image) == [np.flatnonzero(kept & (ring == r)).tolist() for r in range(8)]
     assert int(image.count[3]) == 0
@@ -46,7 +46,7 @@ def test_rings_hold_their_points_in_order_of_arrival(seed, order):
 def test_the_first_point_of_a_column_takes_it(seed):
     scan = random_scan(seed)
     columns = 120  # 375 firings a turn: three fall into each
-    image = IMAGE(LoamRingConfig(rings=8, columns=columns, order="azimuth"), LOAM_PARAMS, scan)
+    image = IMAGE(LoamRingConfig(rings=8, columns=columns, order="azimuth"), LOAM_PARAMS.lidar, scan)
     column = np.asarray(azimuth_column(scan.points, columns))
     wanted = [dict[int, int]() for _ in range(8)]
     for row in np.flatnonzero(kept_points(scan)):
@@ -98,7 +98,7 @@ def test_a_ring_that_is_too_long_is_thinned_evenly_and_its_loss_counted():
     azimuth = np.linspace(0, 6, 1000)
     points = 10 * np.c_[np.cos(azimuth), np.sin(azimuth), np.zeros(1000)]
     scan = scan_of(np.r_[points, points[:50]], np.r_[np.zeros(1000), np.ones(50)])
-    image = IMAGE(LoamRingConfig(rings=2, columns=300), LOAM_PARAMS, scan)
+    image = IMAGE(LoamRingConfig(rings=2, columns=300), LOAM_PARAMS.lidar, scan)
     assert image.count.tolist() == [300, 50]
     assert int(image.dropped) == 700
     long, short = rings_of(image)
@@ -110,7 +110,7 @@ def test_a_ring_that_is_too_long_is_thinned_evenly_and_its_loss_counted():
 
 def test_points_of_rings_beyond_the_configured_ones_are_counted_as_dropped():
     scan = random_scan(1)
-    image = IMAGE(LoamRingConfig(rings=6, columns=500), LOAM_PARAMS, scan)
+    image = IMAGE(LoamRingConfig(rings=6, columns=500), LOAM_PARAMS.lidar, scan)
     assert int(image.dropped) == (kept_points(scan) & (np.asarray(scan.ring) >= 6)).sum() > 0
 
 
@@ -118,7 +118,7 @@ def test_rings_without_a_number_and_rings_in_between_are_left_out():
     scan = random_scan(2)
     unknown = np.where(np.arange(scan.ring.size) % 7 == 0, -1, np.asarray(scan.ring)).astype(np.int32)
     scan = on_device(type(scan)(**{**vars(scan), "ring": unknown}))
-    image = IMAGE(LoamRingConfig(rings=8, columns=500, ring_step=2), LOAM_PARAMS, scan)
+    image = IMAGE(LoamRingConfig(rings=8, columns=500, ring_step=2), LOAM_PARAMS.lidar, scan)
     kept = kept_points(scan) & (unknown % 2 == 0) & (unknown >= 0)
     assert rings_of(image) == [np.flatnonzero(kept & (unknown == r)).tolist() for r in range(8)]
     assert int(image.dropped) == 0
@@ -127,7 +127,7 @@ def test_rings_without_a_number_and_rings_in_between_are_left_out():
 @pytest.mark.parametrize("order", ["arrival", "azimuth"])
 def test_a_scan_without_points_has_empty_rings(order):
     scan = scan_of(np.full((40, 3), np.nan), np.zeros(40))
-    image = IMAGE(LoamRingConfig(rings=4, columns=64, order=order), LOAM_PARAMS, scan)
+    image = IMAGE(LoamRingConfig(rings=4, columns=64, order=order), LOAM_PARAMS.lidar, scan)
     assert rings_of(image) == [[], [], [], []]
     assert int(image.dropped) == 0
 
@@ -138,6 +138,6 @@ def test_range_limits_are_traced():
         lambda *leaves: jnp.stack(leaves), *(params_of(lidar__max_range=far) for far in (8.0, 12.0, 50.0))
     )
     config = LoamRingConfig(rings=8, columns=500)
-    images = jax.jit(jax.vmap(lambda params: range_image(config, params, scan)))(batch)
+    images = jax.jit(jax.vmap(lambda params: range_image(config, params.lidar, scan)))(batch)
     for row, far in enumerate((8.0, 12.0, 50.0)):
         assert images.count[row].sum() == kept_points(scan, params_of(lidar__max_range=far)).sum()

@@ -55,7 +55,7 @@ def corridor(sigma=0.0, jitter=0.0, poles=0, seed=0, rings=32, columns=1024, ord
 
 
 def values(scan: Scan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    found = _scatter(scan, PARAMS)
+    found = _scatter(scan, PARAMS.lidar)
     valid = np.asarray(found.valid)
     return tuple(np.asarray(part)[valid] for part in (found.deviation, found.spread, found.slope))
 
@@ -84,10 +84,10 @@ def test_deviations_are_as_wide_as_the_beams_noise_makes_them():
 def test_returns_out_of_range_and_padding_do_not_count():
     scan = corridor(0.02)
     limited = dataclasses.replace(PARAMS.lidar, min_range=jnp.array(5.0), max_range=jnp.array(12.0))
-    found = _scatter(scan, dataclasses.replace(PARAMS, lidar=limited))
-    assert 0 < int(jnp.sum(found.valid)) < int(jnp.sum(_scatter(scan, PARAMS).valid))
+    found = _scatter(scan, limited)
+    assert 0 < int(jnp.sum(found.valid)) < int(jnp.sum(_scatter(scan, PARAMS.lidar).valid))
     nothing = dataclasses.replace(scan, mask=jnp.zeros_like(scan.mask))
-    found = _scatter(nothing, PARAMS)
+    found = _scatter(nothing, PARAMS.lidar)
     assert not found.valid.any()
     assert np.isfinite(np.asarray(found.deviation)).all()
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.status import LOST
+from lio_jax.core.types import LOST
 from lio_jax.core.xla import PerShape
 from lio_jax.recipes import RECIPES, recipe_named
 from lio_jax.recipes.recipe import Output, Recipe, State

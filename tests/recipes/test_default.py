@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.status import CONVERGED, LOST
-from lio_jax.core.types import Scan
+from lio_jax.core.types import CONVERGED, LOST, Scan
 from lio_jax.recipes.default import Default
 from tests.recipes.drive import (
     CONFIG,

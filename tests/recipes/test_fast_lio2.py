@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.error_state import EXTRINSIC_ROTATION, GYRO_BIAS, POSITION
-from lio_jax.core.status import LOST
+from lio_jax.core.types import LOST
 from lio_jax.recipes.fast_lio2 import FastLio2
 from lio_jax.run.scan_inputs import ImuFeed, padded
 from lio_jax.settings.settings import Settings, recipe_settings, with_extrinsics, with_overrides

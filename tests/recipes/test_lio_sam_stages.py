@@ -10,8 +10,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.core.status import CONVERGED, LOST
-from lio_jax.core.types import ImuBatch, Scan, initial_nav_state
+from lio_jax.core.types import CONVERGED, LOST, ImuBatch, Scan, initial_nav_state
 from lio_jax.lidar.features import FeatureCloud
 from lio_jax.mapping.feature_map import FeaturePoints, Submap, empty_feature_map
 from lio_jax.mapping.keyframes import no_keyframes

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.status import LOST
+from lio_jax.core.types import LOST
 from lio_jax.core.xla import PerShape
 from lio_jax.recipes import loam
 from lio_jax.recipes.loam import Loam

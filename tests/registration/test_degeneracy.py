@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.status import CONVERGED
+from lio_jax.core.types import CONVERGED
 from tests.registration.scenes import (
     GROUND,
     box_room,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, LOST
+from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, LOST
 from lio_jax.mapping.voxel_map import empty_map
 from lio_jax.registration.gauss_newton import Registration, gauss_newton
 from lio_jax.registration.voxel_planes import ScanToVoxels

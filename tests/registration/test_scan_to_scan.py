@@ -8,7 +8,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.core.status import CONVERGED, LOST
+from lio_jax.core.types import CONVERGED, LOST
 from lio_jax.lidar.features import loam_features
 from lio_jax.lidar.params import LoamRingConfig
 from lio_jax.mapping.feature_map import FeaturePoints

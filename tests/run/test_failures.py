@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.core.status import CONVERGED, ITERATION_LIMIT, LOST, NOT_FINITE
-from lio_jax.core.types import ImuBatch
+from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, LOST, NOT_FINITE, ImuBatch
 from lio_jax.run.failures import Evidence, failure_of, longest_gap, unobserved_directions
 from lio_jax.settings.settings import Settings, with_overrides
 
