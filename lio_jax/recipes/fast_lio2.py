@@ -22,8 +22,10 @@ from lio_jax.imu.params import ImuParams, InitialParams
 from lio_jax.imu.path import deskew_along
 from lio_jax.lidar.params import LidarParams, ScanConfig
 from lio_jax.lidar.thinning import mean_per_voxel
+from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.params import MapConfig, MapParams, MovingCubeParams
 from lio_jax.mapping.point_map import EDGE, PointMap, empty_map, insert, move_cube
+from lio_jax.mapping.voxel_map import anchor_of
 from lio_jax.recipes import recipe
 from lio_jax.recipes.constant_velocity import (
     carried_on,
@@ -216,6 +218,7 @@ class FastLio2(Recipe[Config, Params, State]):
             spacing = params.registration.point_spacing.astype(jnp.float32)
             thin = mean_per_voxel(points, in_range, spacing, config.lidar.registration_points)
         with jax.named_scope("update"):
+            frame = Frame(*anchor_of(T_predicted.translation(), EDGE * params.map.voxel_size))
             match = ScanToPoints(
                 points_at=FixedPoints(thin.points),
                 T_predicted=T_predicted,
@@ -225,9 +228,9 @@ class FastLio2(Recipe[Config, Params, State]):
                 map_params=params.map,
                 knn=params.knn,
                 lidar=params.lidar,
+                origin=frame,
                 neighbours=config.knn.neighbours,
             )
-            frame = match.frame()
             update, _ = corrected(prior, match, config.registration.max_iterations)
             posterior: NavEstimate = update.state
             lost = (update.status > ITERATION_LIMIT) & ~first

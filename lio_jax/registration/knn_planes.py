@@ -11,8 +11,7 @@ from lio_jax.lidar.params import LidarParams
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.nearest_points import nearest_points
 from lio_jax.mapping.params import MapParams
-from lio_jax.mapping.point_map import EDGE, PointMap
-from lio_jax.mapping.voxel_map import anchor_of
+from lio_jax.mapping.point_map import PointMap
 from lio_jax.registration.params import KnnParams, ScoredFitParams
 from lio_jax.registration.scan_match import NormalEquations, ScanMatch
 
@@ -199,6 +198,8 @@ class ScanToPoints(ScanMatch[Array, Planes]):
     map_params: MapParams
     knn: ScoredFitParams
     lidar: LidarParams
+    origin: Frame
+    """Frame of the matches, near the sensor."""
     neighbours: int = eqx.field(static=True)
 
     def together(self, points: Float[Array, "k 3"]) -> tuple[Float[Array, "k 3"], Bool[Array, " k"]]:
@@ -218,5 +219,5 @@ class ScanToPoints(ScanMatch[Array, Planes]):
         return linearise(found, points, T_world_lidar, self.frame(), self.knn, self.lidar)
 
     def frame(self) -> Frame:
-        """Return the frame of the matches, near the sensor."""
-        return Frame(*anchor_of(self.T_predicted.translation(), EDGE * self.map_params.voxel_size))
+        """Return the frame of the matches."""
+        return self.origin
