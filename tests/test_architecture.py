@@ -147,8 +147,8 @@ def test_what_the_package_imports_is_installed_with_it():
 
 
 MODULES = {module_name(path): path for path in FILES}
-MOST_MODULES = 250
-"""A reader has to find a way among them: a new one earns its place, or one goes."""
+MOST_MODULES = 240
+"""Limit of the number of files: a new one earns its place, or another one goes."""
 
 
 def modules_imported(module: str) -> set[str]:
@@ -193,8 +193,7 @@ def test_the_rule_can_see_a_cycle():
 
 
 def test_there_are_not_too_many_modules():
-    modules = [module for module, path in MODULES.items() if path.name != "__init__.py"]
-    assert len(modules) <= MOST_MODULES
+    assert len(list(PACKAGE.rglob("*.py"))) <= MOST_MODULES
 
 
 PUBLIC = [

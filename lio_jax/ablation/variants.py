@@ -10,8 +10,14 @@ from typing import Any
 import numpy as np
 
 from lio_jax.core.errors import UsageError
-from lio_jax.recipes import recipe_named
-from lio_jax.settings.settings import Settings, checked_together, load_settings, recipe_settings
+from lio_jax.settings.settings import (
+    Settings,
+    checked_together,
+    declared_settings,
+    every_path,
+    load_settings,
+    recipe_settings,
+)
 
 Overrides = dict[str, Any]
 
@@ -66,7 +72,7 @@ def variants(
     short = _short_names(paths)
     found: dict[str, Variant] = {}
     for name, overrides in wanted:
-        settings = _settings(recipe, common | overrides, folder, place)
+        settings = _settings(recipe, common, overrides, folder, place)
         words = [f"{short[path]}={_word(value)}" for path, value in overrides.items()]
         label = name or " ".join(words) or Path(recipe).stem
         identity = json.dumps(settings.as_dict()) + repr(sorted(settings.given))
@@ -77,8 +83,8 @@ def variants(
     return list(found.values())
 
 
-def _settings(recipe: str, overrides: Overrides, folder: Path, place: str) -> Settings:
-    chosen = str(overrides.get("recipe", recipe))
+def _settings(recipe: str, common: Overrides, overrides: Overrides, folder: Path, place: str) -> Settings:
+    chosen = str((common | overrides).get("recipe", recipe))
     if chosen.endswith((".yaml", ".yml")):
         beside = folder / chosen
         settings = load_settings(beside if beside.exists() else Path(chosen))
@@ -88,10 +94,13 @@ def _settings(recipe: str, overrides: Overrides, folder: Path, place: str) -> Se
         settings = recipe_settings(
             str(own) if own.with_name(own.name.rpartition(":")[0]).is_file() else chosen
         )
-    for path, value in overrides.items():
+    # what is set for all variants holds for those whose recipe reads it
+    known = declared_settings(settings.recipe)
+    elsewhere = every_path() - set(known)
+    shared = {path: value for path, value in common.items() if path not in elsewhere}
+    for path, value in (shared | overrides).items():
         if path != "recipe":
             settings = settings.with_value(path, value, place)
-    recipe_named(settings.recipe)
     return checked_together(settings, place)
 
 

@@ -2,11 +2,8 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, rfft2
@@ -14,7 +11,6 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.leaf import numbers_of, traced
-from lio_jax.core.types import state_dtype
 from lio_jax.loops.alignment import aligned
 from lio_jax.loops.keyframe import Keyframe, level_points, padded, thinned
 from lio_jax.loops.overlap import LEAST_POINTS, Candidate, Comparison, conflict
@@ -211,7 +207,7 @@ def verify(
         *padded(ours, sizes.source_points),
         _guesses(found, stations),
         sizes.starts,
-        _params(limits["aligning_voxel"], state_dtype()),
+        _aligning_params(settings),
     )
     comparison = Comparison(theirs, stations, ours[our_upright], limits["overlap_distance"])
     candidates = comparison.candidates(result, poses[[target, source]])
@@ -328,11 +324,14 @@ def _guesses(found: Fits, targets: _Array) -> _Array:
     return guesses
 
 
-@cache
-def _params(voxel_size: float, dtype: jnp.dtype) -> AlignmentParams:
-    """Return the parameters of the alignment, which do not depend on the recipe."""
-    size = jnp.asarray(voxel_size, dtype)
-    return eqx.tree_at(lambda params: params.map.voxel_size, traced(AlignmentParams), size)
+def _aligning_params(settings: BackEndSettings) -> AlignmentParams:
+    """Return the parameters of the alignment: the run's where its recipe has them, else the defaults."""
+    values = {
+        section: {name: settings.values[section].get(name, default) for name, default in leaves.items()}
+        for section, leaves in numbers_of(AlignmentParams).items()
+    }
+    values["map"]["voxel_size"] = settings.values["loop"]["aligning_voxel"]
+    return traced(AlignmentParams, values)
 
 
 def _wrapped(angle: float) -> float:

@@ -84,7 +84,7 @@ class SubmapParams(eqx.Module):
     radius: Scalar = leaf(50.0, "m", above=0)
     """Keyframes within this distance are kept in the map. A keyframe that comes back into it enters anew."""
     spacing: Scalar = leaf(2.0, "m", least=0)
-    """Of the keyframes in the map, one per this distance is kept; the places of the others are reused once
+    """Distance between keyframes that stay in the map. The places of keyframes in between are reused once
     they are older than ``recent``."""
     recent: Scalar = leaf(10.0, "s", least=0)
     """Keyframes younger than this always stay in the map."""

@@ -262,7 +262,7 @@ def _leaves(tree: dict[Any, Any], source: str, prefix: str = "") -> list[tuple[s
         path = f"{prefix}{key}"
         if isinstance(value, dict):
             found += _leaves(value, source, f"{path}.")
-        elif any(known.startswith(f"{path}.") for known in _all_paths()):
+        elif any(known.startswith(f"{path}.") for known in every_path()):
             if value is not None:
                 raise UsageError(
                     f"{source}: {path} = {value!r} must hold keys, for example {_example(path)}."
@@ -273,12 +273,13 @@ def _leaves(tree: dict[Any, Any], source: str, prefix: str = "") -> list[tuple[s
 
 
 @cache
-def _all_paths() -> tuple[str, ...]:
-    return tuple(dict.fromkeys(path for recipe in RECIPES.values() for path in _paths(recipe)))
+def every_path() -> frozenset[str]:
+    """Return the paths that any recipe of the package reads."""
+    return frozenset(path for recipe in RECIPES.values() for path in _paths(recipe))
 
 
 def _example(path: str) -> str:
-    return next(known for known in _all_paths() if known.startswith(f"{path}."))
+    return next(known for known in sorted(every_path()) if known.startswith(f"{path}."))
 
 
 def _nearest(path: str, recipe: str) -> str:

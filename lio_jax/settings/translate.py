@@ -15,7 +15,7 @@ from lio_jax.core.errors import UsageError
 from lio_jax.settings.foreign_rules import Rule, System
 from lio_jax.settings.from_fast_lio2 import FAST_LIO2
 from lio_jax.settings.from_lio_sam import LIO_SAM
-from lio_jax.settings.settings import Settings, checked_together
+from lio_jax.settings.settings import Settings, checked_together, declared_settings
 
 SYSTEMS = (LIO_SAM, FAST_LIO2)
 
@@ -49,8 +49,15 @@ class ForeignSettings:
     keys: tuple[ForeignKey, ...]
 
     def taken(self, recipe: str) -> tuple[ForeignKey, ...]:
-        """Return the keys whose settings a recipe takes."""
-        return tuple(k for k in self.keys if k.settings and (recipe == self.system.recipe or not k.method))
+        """Return the keys whose settings a recipe reads."""
+        known = declared_settings(recipe)
+        return tuple(
+            key
+            for key in self.keys
+            if key.settings
+            and (recipe == self.system.recipe or not key.method)
+            and all(path in known for path in key.settings)
+        )
 
     def applied_to(self, settings: Settings) -> Settings:
         """Return the settings with those values of the file that their recipe takes.

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from lio_jax.core.leaf import traced
 from lio_jax.loops.alignment import aligned
 from lio_jax.loops.keyframe import padded, thinned
+from lio_jax.loops.params import AlignmentParams
 from tests.loops.places import pose, seen_from
-from tests.params import default_params
 
 TRUTH = pose(2.0, -1.0, 0.2, 0.4)
 
@@ -25,7 +26,9 @@ def yard():
 
 
 def solve(target, source, guesses, most=3):
-    return aligned(*padded(target, 32768), *padded(source, 1024), np.array(guesses), most, default_params())
+    return aligned(
+        *padded(target, 32768), *padded(source, 1024), np.array(guesses), most, traced(AlignmentParams)
+    )
 
 
 @pytest.fixture(scope="module")

@@ -9,15 +9,15 @@ import jaxlie
 import numpy as np
 from scipy.linalg import expm
 
+from lio_jax.core.leaf import numbers_of, traced
 from lio_jax.core.types import Scan
 from lio_jax.mapping.params import MapConfig
 from lio_jax.recipes.default import Default, State
-from lio_jax.recipes.default_params import ThinnedScanConfig
+from lio_jax.recipes.default_params import Config, Params, ThinnedScanConfig
 from lio_jax.recipes.recipe import Output
 from lio_jax.sim.assembly import assembled
 from lio_jax.sim.lidar import column_times, spinning_lidar, sweep
 from lio_jax.sim.worlds import Counts, World, nearest_part
-from tests.params import DEFAULTS, Config, Params, params_from_values
 
 PERIOD, BEAMS, COLUMNS = 0.1, 16, 256
 CONFIG = Config(
@@ -111,12 +111,12 @@ HALL = {
 
 def params_with(**paths: float | list[float]) -> Params:
     """Return default parameters fit for the hall, with changes, for example ``map__reach=50.0``."""
-    values = {section: dict(leaves) for section, leaves in DEFAULTS.items()}
+    values = {section: dict(leaves) for section, leaves in numbers_of(Params).items()}
     for path, value in {**HALL, **paths}.items():
         section, name = path.split("__")
         assert name in values[section]
         values[section][name] = value
-    return params_from_values(values)
+    return traced(Params, values)
 
 
 PARAMS = params_with()

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lio_jax.core.leaf import numbers_of, traced
 from lio_jax.core.types import state_dtype
 from lio_jax.recipes.default import Default
-from tests.params import DEFAULTS, default_params
+from lio_jax.recipes.default_params import Params
 from tests.recipes.drive import (
     CONFIG,
     PARAMS,
@@ -22,7 +23,7 @@ from tests.recipes.drive import (
     scan,
 )
 
-PATHS = [f"{section}__{name}" for section, leaves in DEFAULTS.items() for name in leaves]
+PATHS = [f"{section}__{name}" for section, leaves in numbers_of(Params).items() for name in leaves]
 
 SETS = [
     {},
@@ -37,7 +38,7 @@ SETS = [
 
 
 def test_every_leaf_has_a_path():
-    assert len(PATHS) == len(jax.tree.leaves(default_params()))
+    assert len(PATHS) == len(jax.tree.leaves(traced(Params)))
 
 
 @pytest.mark.parametrize("path", PATHS)

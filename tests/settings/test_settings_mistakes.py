@@ -130,7 +130,7 @@ def test_a_ring_must_have_more_room_than_a_point_has_neighbours():
     with pytest.raises(
         UsageError, match=r"^my\.yaml: config\.features\.columns \(16\) must be more than twice"
     ):
-        settings_from_yaml("config: {features: {columns: 16, neighbours: 8}}", SOURCE)
+        settings_from_yaml("recipe: loam\nconfig: {features: {columns: 16, neighbours: 8}}", SOURCE)
 
 
 @pytest.mark.parametrize("text", ["params: [", "a: b: c", "\tconfig: {}", "params: {map: {reach: 5}"])

@@ -8,7 +8,7 @@ import numpy as np
 
 from lio_jax.run.run import settings_for
 from lio_jax.run.track import ScanInput
-from lio_jax.settings.settings import Settings, recipe_settings, with_overrides
+from lio_jax.settings.settings import Settings, declared_settings, recipe_settings, with_overrides
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
 from lio_jax.tuning.recording import Recording
@@ -70,6 +70,8 @@ def settings(recipe: str, inertial: bool, *more: str) -> Settings:
     ]
     if not inertial:
         overrides.append("config.imu.use=false")
+    read = declared_settings(recipe)
+    overrides = [one for one in overrides if one.partition("=")[0] in read]
     return settings_for(drive(), with_overrides(recipe_settings(recipe), overrides))[0]
 
 
