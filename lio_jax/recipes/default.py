@@ -5,17 +5,17 @@ from typing import ClassVar
 
 from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.recipes import lidar_inertial, lidar_odometry
-from lio_jax.recipes.default_params import Config, Params
+from lio_jax.recipes.default_params import DefaultConfig, DefaultParams
 from lio_jax.recipes.recipe import Output, Recipe
 
-State = lidar_inertial.State | lidar_odometry.State
+DefaultState = lidar_inertial.InertialState | lidar_odometry.LidarState
 
 
-class Default(Recipe[Config, Params, State]):
+class Default(Recipe[DefaultConfig, DefaultParams, DefaultState]):
     """The project's own recipe: Gauss-Newton or an iterated filter on the planes of a voxel map."""
 
-    config_type = Config
-    params_type = Params
+    config_type = DefaultConfig
+    params_type = DefaultParams
     # with the values for streets, voxels hold more than one wall: on 20 s of walking in a simulated office
     # the trajectory's error was 32 mm instead of 7 mm
     near_values: ClassVar[Mapping[str, float]] = {
@@ -26,17 +26,17 @@ class Default(Recipe[Config, Params, State]):
         "params.registration.inertial_point_spacing": 0.2,
     }
 
-    def init(self, params: Params, imu: ImuBatch | None = None) -> State:
+    def init(self, params: DefaultParams, imu: ImuBatch | None = None) -> DefaultState:
         """Return the state before the first scan; its form depends on whether there are inertial samples."""
         if imu is None:
             return lidar_odometry.init(self.config, params)
         return lidar_inertial.init(self.config, params, imu)
 
     def step(
-        self, params: Params, state: State, scan: Scan, imu: ImuBatch | None = None
-    ) -> tuple[State, Output]:
+        self, params: DefaultParams, state: DefaultState, scan: Scan, imu: ImuBatch | None = None
+    ) -> tuple[DefaultState, Output]:
         """Estimate one scan's pose and add the scan to the map."""
-        if isinstance(state, lidar_odometry.State):
+        if isinstance(state, lidar_odometry.LidarState):
             return lidar_odometry.step(self.config, params, state, scan)
         assert imu is not None
         return lidar_inertial.step(self.config, params, state, scan, imu)

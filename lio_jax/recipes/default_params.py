@@ -25,7 +25,7 @@ class VoxelMatch(GaussNewtonMatch, RobustFilterMatch, ThinnedMatch, InertialThin
     """A match with the planes of a voxel map, by Gauss-Newton or in the filter."""
 
 
-class Params(InertialParams):
+class DefaultParams(InertialParams):
     """Traced parameters of the default recipe."""
 
     lidar: BeamParams = section(BeamParams)
@@ -57,7 +57,7 @@ class ThinnedInertialConfig(ImuConfig):
 
 
 @dataclass(frozen=True)
-class Config(InertialConfig):
+class DefaultConfig(InertialConfig):
     """Static settings of the default recipe."""
 
     lidar: ThinnedScanConfig = section(ThinnedScanConfig)

@@ -68,11 +68,11 @@ def density_of(cov: float) -> float:
     return (cov / IMU_RATE) ** 0.5
 
 
-class Match(FilterMatch, ThinnedMatch):
+class FastLio2Match(FilterMatch, ThinnedMatch):
     """A match of the thinned scan in the filter."""
 
 
-class Params(InertialParams):
+class FastLio2Params(InertialParams):
     """Traced parameters of FAST-LIO2, in SI units."""
 
     imu: ImuParams = section(
@@ -96,8 +96,8 @@ class Params(InertialParams):
     # its variance of a point's distance from its plane is 1e-3 m^2
     lidar: LidarParams = section(LidarParams, range_sigma=1e-3**0.5)
     map: MapParams = section(MapParams, voxel_size=0.5)
-    registration: Match = section(
-        Match,
+    registration: FastLio2Match = section(
+        FastLio2Match,
         point_spacing=0.5,
         information_scale=1.0,
         reassociation_distance=0.01,
@@ -110,7 +110,7 @@ class Params(InertialParams):
 
 
 @dataclass(frozen=True)
-class ThinnedScanConfig(ScanConfig):
+class FastLio2ScanConfig(ScanConfig):
     """Capacity of the thinned scan."""
 
     registration_points: int = static(4096, above=0)
@@ -127,17 +127,17 @@ class FilterConfig:
 
 
 @dataclass(frozen=True)
-class Config(InertialConfig):
+class FastLio2Config(InertialConfig):
     """Static settings of FAST-LIO2."""
 
-    lidar: ThinnedScanConfig = section(ThinnedScanConfig)
+    lidar: FastLio2ScanConfig = section(FastLio2ScanConfig)
     map: MapConfig = section(MapConfig, capacity=65536)
     registration: RegistrationConfig = section(RegistrationConfig, max_iterations=4)
     knn: KnnConfig = section(KnnConfig)
     fast_lio2: FilterConfig = section(FilterConfig)
 
 
-class State(recipe.State):
+class FastLio2State(recipe.State):
     """What is carried from scan to scan."""
 
     nav: NavState
@@ -153,7 +153,7 @@ class State(recipe.State):
     """Number of scans with points so far."""
     map: PointMap
 
-    def with_velocity_of(self, found: "State") -> "State":
+    def with_velocity_of(self, found: "FastLio2State") -> "FastLio2State":
         """Return this first state with the velocity of a later one, and with its angular rate."""
 
         def motion(state: Any) -> tuple[Any, ...]:
@@ -162,14 +162,14 @@ class State(recipe.State):
         return eqx.tree_at(motion, self, motion(found))
 
 
-class FastLio2(Recipe[Config, Params, State]):
+class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
     """FAST-LIO2."""
 
     needs = Needs()
-    config_type = Config
-    params_type = Params
+    config_type = FastLio2Config
+    params_type = FastLio2Params
 
-    def init(self, params: Params, imu: ImuBatch | None = None) -> State:
+    def init(self, params: FastLio2Params, imu: ImuBatch | None = None) -> FastLio2State:
         """Return the state before the first scan: at the world's origin.
 
         Args:
@@ -179,7 +179,7 @@ class FastLio2(Recipe[Config, Params, State]):
         config = self.config
         start = unlevelled_start(params) if imu is None else levelled_start(params, imu)
         none = jnp.zeros_like(start.nav.velocity)
-        return State(
+        return FastLio2State(
             nav=start.nav,
             uncertain=start,
             rate=none,
@@ -189,8 +189,8 @@ class FastLio2(Recipe[Config, Params, State]):
         )
 
     def step(
-        self, params: Params, state: State, scan: Scan, imu: ImuBatch | None = None
-    ) -> tuple[State, Output]:
+        self, params: FastLio2Params, state: FastLio2State, scan: Scan, imu: ImuBatch | None = None
+    ) -> tuple[FastLio2State, Output]:
         """Predict by the inertial samples, correct by the scan, add the scan to the map.
 
         Args:
@@ -255,7 +255,7 @@ class FastLio2(Recipe[Config, Params, State]):
 
         seen = jnp.any(thin.mask)
         rate = jnp.where(first | lost, state.rate, mean_rate(state.uncertain.nav, posterior.nav, scan))
-        new_state = State(
+        new_state = FastLio2State(
             nav=carried_on(posterior.nav, rate, to_end) if imu is None else posterior.nav,
             uncertain=posterior,
             rate=rate,
@@ -280,7 +280,7 @@ class FastLio2(Recipe[Config, Params, State]):
 
 
 def _filtered(
-    every: int, params: Params, scan: Scan
+    every: int, params: FastLio2Params, scan: Scan
 ) -> tuple[Float[Array, "n 3"], Float[Array, " n"], Bool[Array, " n"]]:
     """Return every n-th point, its time, and whether it lies between the blind radius and the far limit."""
     points, time = scan.points[::every], scan.time[::every]

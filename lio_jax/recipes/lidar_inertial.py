@@ -18,7 +18,7 @@ from lio_jax.imu.path import Path, deskew_along
 from lio_jax.lidar.thinning import ThinnedScan, thinned
 from lio_jax.mapping.voxel_map import VoxelMap, empty_map, insert
 from lio_jax.recipes import recipe
-from lio_jax.recipes.default_params import Config, Params
+from lio_jax.recipes.default_params import DefaultConfig, DefaultParams
 from lio_jax.recipes.inertial_filter import (
     corrected,
     evidence_of,
@@ -33,7 +33,7 @@ from lio_jax.registration.scan_match import FixedPoints
 from lio_jax.registration.voxel_planes import ScanToVoxels
 
 
-class State(recipe.State):
+class InertialState(recipe.State):
     """What is carried from scan to scan."""
 
     nav: NavState
@@ -52,12 +52,12 @@ class State(recipe.State):
         """The navigation state and its covariance."""
         return NavEstimate(self.nav, self.covariance)
 
-    def with_velocity_of(self, found: "State") -> "State":
+    def with_velocity_of(self, found: "InertialState") -> "InertialState":
         """Return this first state with the velocity of a later one."""
         return eqx.tree_at(lambda state: state.nav.velocity, self, found.nav.velocity)
 
 
-def init(config: Config, params: Params, imu: ImuBatch) -> State:
+def init(config: DefaultConfig, params: DefaultParams, imu: ImuBatch) -> InertialState:
     """Return the state before the first scan: at the world's origin, levelled by the samples.
 
     Args:
@@ -67,7 +67,7 @@ def init(config: Config, params: Params, imu: ImuBatch) -> State:
     """
     start = levelled_start(params, imu)
     dtype = start.covariance.dtype
-    return State(
+    return InertialState(
         nav=start.nav,
         covariance=start.covariance,
         drift=MapDrift.none(dtype),
@@ -77,7 +77,9 @@ def init(config: Config, params: Params, imu: ImuBatch) -> State:
     )
 
 
-def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch) -> tuple[State, Output]:
+def step(
+    config: DefaultConfig, params: DefaultParams, state: InertialState, scan: Scan, imu: ImuBatch
+) -> tuple[InertialState, Output]:
     """Predict by the inertial samples, correct by the scan, add the scan to the map.
 
     Args:
@@ -131,7 +133,7 @@ def step(config: Config, params: Params, state: State, scan: Scan, imu: ImuBatch
         new = jnp.sum(added.added) / jnp.maximum(jnp.sum(thin.mask), 1)
         drift = state.drift.carried(state.nav.T_world_imu, posterior.nav.T_world_imu)
 
-    new_state = State(
+    new_state = InertialState(
         nav=posterior.nav,
         covariance=posterior.covariance,
         drift=drift.grown(posterior.covariance, new, state.scans),

@@ -15,13 +15,13 @@ from lio_jax.lidar.thinning import thinned
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
 from lio_jax.recipes import recipe
-from lio_jax.recipes.default_params import Config, Params
+from lio_jax.recipes.default_params import DefaultConfig, DefaultParams
 from lio_jax.recipes.recipe import Output
 from lio_jax.registration.gauss_newton import gauss_newton
 from lio_jax.registration.voxel_planes import ScanToVoxels
 
 
-class State(recipe.State):
+class LidarState(recipe.State):
     """What is carried from scan to scan."""
 
     nav: NavState
@@ -38,12 +38,12 @@ class State(recipe.State):
     """Number of scans with points so far."""
     map: VoxelMap
 
-    def with_velocity_of(self, found: "State") -> "State":
+    def with_velocity_of(self, found: "LidarState") -> "LidarState":
         """Return this first state with the velocity of a later one."""
         return eqx.tree_at(lambda state: state.twist, self, found.twist)
 
 
-def init(config: Config, params: Params) -> State:
+def init(config: DefaultConfig, params: DefaultParams) -> LidarState:
     """Return the state before the first scan: at the world's origin, with an empty map.
 
     Args:
@@ -52,7 +52,7 @@ def init(config: Config, params: Params) -> State:
     """
     nav = initial_nav_state(params.extrinsics.T_imu_lidar())
     dtype = nav.velocity.dtype
-    return State(
+    return LidarState(
         nav=nav,
         T_world_lidar=nav.T_world_imu @ nav.T_imu_lidar,
         mid_to_end=jnp.zeros((), dtype),
@@ -63,7 +63,9 @@ def init(config: Config, params: Params) -> State:
     )
 
 
-def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[State, Output]:
+def step(
+    config: DefaultConfig, params: DefaultParams, state: LidarState, scan: Scan
+) -> tuple[LidarState, Output]:
     """Register one scan and add it to the map.
 
     Velocity is taken as constant from the middle of the last scan to the middle of this one, and is solved
@@ -124,7 +126,7 @@ def step(config: Config, params: Params, state: State, scan: Scan) -> tuple[Stat
         (jaxlie.SE3(T_world_imu.wxyz_xyz), _imu_velocity(T_world_imu, twist, params)),
     )
     seen = jnp.any(thin.mask)
-    new_state = State(
+    new_state = LidarState(
         nav=nav,
         T_world_lidar=T,
         mid_to_end=motion.middle,
@@ -161,7 +163,9 @@ class _Deskewed(eqx.Module):
         return self.motion.compensated(self.points, self.time, self.T_last.inverse() @ T_world_lidar)
 
 
-def _imu_velocity(T_world_imu: jaxlie.SE3, twist: Float[Array, "6"], params: Params) -> Float[Array, "3"]:
+def _imu_velocity(
+    T_world_imu: jaxlie.SE3, twist: Float[Array, "6"], params: DefaultParams
+) -> Float[Array, "3"]:
     """Return the IMU origin's velocity in world from the lidar's twist in its own frame."""
     in_imu = params.extrinsics.T_imu_lidar().adjoint() @ twist
     return T_world_imu.rotation() @ in_imu[:3]

@@ -31,14 +31,14 @@ from lio_jax.lidar.features import (
 from lio_jax.mapping.feature_map import Submap, empty_feature_map
 from lio_jax.mapping.keyframes import no_keyframes
 from lio_jax.recipes.inertial_filter import levelled_start, lidar_pose
-from lio_jax.recipes.lio_sam_params import Config, Params
+from lio_jax.recipes.lio_sam_params import LioSamConfig, LioSamParams
 from lio_jax.recipes.lio_sam_stages import (
     Addition,
     Clock,
     Features,
+    LioSamState,
     MapMatch,
     Smoothing,
-    State,
     as_nav,
     clock_at,
     compensated,
@@ -52,19 +52,19 @@ from lio_jax.recipes.recipe import Needs, Output, Recipe
 from lio_jax.recipes.smoothed_odometry import measured_attitude, opened
 
 
-class LioSam(Recipe[Config, Params, State]):
+class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
     """LIO-SAM without its back end."""
 
     needs = Needs(imu="required", rings=True)
-    config_type = Config
-    params_type = Params
+    config_type = LioSamConfig
+    params_type = LioSamParams
     given_values: ClassVar[Mapping[str, Any]] = {
         "config.backend.gps_elevation": False,
         "params.gps.pose_variance": 25.0,
         "params.gps.max_variance": 2.0,
     }
 
-    def init(self, params: Params, imu: ImuBatch | None = None) -> State:
+    def init(self, params: LioSamParams, imu: ImuBatch | None = None) -> LioSamState:
         """Return the state before the first scan: at the world's origin, levelled, with an empty map.
 
         Args:
@@ -97,7 +97,7 @@ class LioSam(Recipe[Config, Params, State]):
         nav = dataclasses.replace(nav, T_world_imu=T_world_imu)
         zero = jnp.zeros((), nav.velocity.dtype)
         keyframes = no_keyframes(own.keyframes, own.corner_points, own.surface_points, zero.dtype)
-        return State(
+        return LioSamState(
             nav=nav,
             window=opened(config, params, nav),
             time=zero,
@@ -107,8 +107,8 @@ class LioSam(Recipe[Config, Params, State]):
         )
 
     def step(
-        self, params: Params, state: State, scan: Scan, imu: ImuBatch | None = None
-    ) -> tuple[State, Output]:
+        self, params: LioSamParams, state: LioSamState, scan: Scan, imu: ImuBatch | None = None
+    ) -> tuple[LioSamState, Output]:
         """Predict by the inertial samples, match one scan with the keyframes around, smooth the window.
 
         Args:
@@ -132,7 +132,7 @@ class LioSam(Recipe[Config, Params, State]):
         nav = dataclasses.replace(as_nav(state.nav, smoothing.window), T_world_imu=smoothing.T_world_imu)
         with jax.named_scope("keyframe"):
             added = keyframe(params, state, clock, points, nav, features, match, smoothing.failed)
-        new_state = State(
+        new_state = LioSamState(
             nav=nav,
             window=smoothing.window,
             time=clock.time,

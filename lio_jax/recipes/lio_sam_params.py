@@ -20,11 +20,11 @@ from lio_jax.registration.params import (
 _DEGREE = 3.141592653589793 / 180
 
 
-class Match(GaussNewtonMatch, WeighedMatch):
+class LioSamMatch(GaussNewtonMatch, WeighedMatch):
     """A match of features by Gauss-Newton, whose result enters the smoother."""
 
 
-class Params(InertialParams):
+class LioSamParams(InertialParams):
     """Traced parameters of LIO-SAM, in SI units."""
 
     imu: ImuParams = section(
@@ -45,8 +45,8 @@ class Params(InertialParams):
     )
     lidar: LidarParams = section(LidarParams, min_range=1.0, max_range=1000.0)
     map: FeatureMapParams = section(FeatureMapParams, voxel_size=0.4, corner_voxel_size=0.2)
-    registration: Match = section(
-        Match,
+    registration: LioSamMatch = section(
+        LioSamMatch,
         reassociation_distance=0.05,
         rotation_tolerance=0.05 * _DEGREE,
         translation_tolerance=5e-4,
@@ -62,7 +62,7 @@ class Params(InertialParams):
 
 
 @dataclass(frozen=True)
-class LioSamConfig:
+class LioSamSizes:
     """Smoother and capacities."""
 
     window: int = static(10, least=2, why="the smoother ties each state to the one before it")
@@ -81,7 +81,7 @@ class LioSamConfig:
 
 
 @dataclass(frozen=True)
-class Config(InertialConfig):
+class LioSamConfig(InertialConfig):
     """Static settings of LIO-SAM."""
 
     imu: OrientedImuConfig = section(OrientedImuConfig)
@@ -89,4 +89,4 @@ class Config(InertialConfig):
     registration: RegistrationConfig = section(RegistrationConfig, max_iterations=30)
     knn: KnnConfig = section(KnnConfig)
     features: RingConfig = section(RingConfig, rings=0, columns=0, surface_points=0, order="azimuth")
-    lio_sam: LioSamConfig = section(LioSamConfig)
+    lio_sam: LioSamSizes = section(LioSamSizes)

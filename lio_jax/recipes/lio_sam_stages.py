@@ -32,7 +32,7 @@ from lio_jax.mapping.keyframes import is_due
 from lio_jax.mapping.point_map import Insertion
 from lio_jax.recipes import recipe
 from lio_jax.recipes.inertial_filter import lidar_pose
-from lio_jax.recipes.lio_sam_params import Config, Params
+from lio_jax.recipes.lio_sam_params import LioSamConfig, LioSamParams
 from lio_jax.recipes.smoothed_odometry import (
     drawn_to_tilt,
     match_as_measurement,
@@ -49,7 +49,7 @@ _TIME_SLACK = 1e-3
 """Sweeps do not end to the last bit in time, s."""
 
 
-class State(recipe.State):
+class LioSamState(recipe.State):
     """What is carried from scan to scan."""
 
     nav: NavState
@@ -64,7 +64,7 @@ class State(recipe.State):
     """Scans with points seen so far."""
     map: Submap
 
-    def with_velocity_of(self, found: "State") -> "State":
+    def with_velocity_of(self, found: "LioSamState") -> "LioSamState":
         """Return this first state with the velocity of a later one."""
         rows = self.window.states.velocity
         velocity = found.nav.velocity
@@ -91,7 +91,7 @@ class Clock(eqx.Module):
     """The scan's end, s from the first scan's."""
 
 
-def clock_at(state: State, scan: Scan) -> Clock:
+def clock_at(state: LioSamState, scan: Scan) -> Clock:
     """Return the times of a scan after a state."""
     first, dtype = state.scans == 0, state.nav.velocity.dtype
     interval = jnp.where(first, 0.0, scan.interval.astype(dtype))
@@ -111,7 +111,9 @@ class Features(eqx.Module):
     """Occupied cells beyond the capacities."""
 
 
-def picked_features(config: Config, params: Params, scan: Scan, first: Bool[Array, ""]) -> Features:
+def picked_features(
+    config: LioSamConfig, params: LioSamParams, scan: Scan, first: Bool[Array, ""]
+) -> Features:
     """Return the corners and surface points of a scan, thinned as the map is.
 
     Args:
@@ -142,7 +144,7 @@ class Prediction(eqx.Module):
     """From the last scan's end on, in the smoother's world."""
 
 
-def predict(state: State, clock: Clock, imu: ImuBatch) -> Prediction:
+def predict(state: LioSamState, clock: Clock, imu: ImuBatch) -> Prediction:
     """Move the last matched pose by the increment of the smoother's state along the samples.
 
     Args:
@@ -182,9 +184,9 @@ class MapMatch(eqx.Module):
 
 
 def scan_to_map(
-    config: Config,
-    params: Params,
-    state: State,
+    config: LioSamConfig,
+    params: LioSamParams,
+    state: LioSamState,
     clock: Clock,
     points: FeaturePoints,
     prediction: Prediction,
@@ -237,9 +239,9 @@ class Smoothing(eqx.Module):
 
 
 def smooth(
-    config: Config,
-    params: Params,
-    state: State,
+    config: LioSamConfig,
+    params: LioSamParams,
+    state: LioSamState,
     clock: Clock,
     points: FeaturePoints,
     prediction: Prediction,
@@ -284,9 +286,9 @@ def smooth(
 
 
 def _appended(
-    config: Config,
-    params: Params,
-    state: State,
+    config: LioSamConfig,
+    params: LioSamParams,
+    state: LioSamState,
     clock: Clock,
     points: FeaturePoints,
     imu: ImuBatch,
@@ -321,8 +323,8 @@ class Addition(eqx.Module):
 
 
 def keyframe(
-    params: Params,
-    state: State,
+    params: LioSamParams,
+    state: LioSamState,
     clock: Clock,
     points: FeaturePoints,
     nav: NavState,

@@ -55,17 +55,17 @@ from lio_jax.registration.scan_match import FixedPoints
 from lio_jax.registration.scan_to_scan import LastScan, ScanToScan, empty_scan, last_scan
 
 
-class Match(GaussNewtonMatch, RobustMatch):
+class LoamMatch(GaussNewtonMatch, RobustMatch):
     """A match of features by Gauss-Newton."""
 
 
-class Params(RecipeParams):
+class LoamParams(RecipeParams):
     """Traced parameters of A-LOAM, in SI units."""
 
     lidar: LidarParams = section(LidarParams, min_range=0.3)
     map: FeatureMapParams = section(FeatureMapParams, voxel_size=0.8, corner_voxel_size=0.4)
-    registration: Match = section(
-        Match,
+    registration: LoamMatch = section(
+        LoamMatch,
         kernel=0.1,
         reassociation_distance=0.05,
         rotation_tolerance=1e-3,
@@ -80,7 +80,7 @@ class Params(RecipeParams):
 
 
 @dataclass(frozen=True)
-class LoamConfig:
+class LoamSizes:
     """Rounds and capacities."""
 
     rounds: int = static(2, above=0)
@@ -100,14 +100,14 @@ class LoamConfig:
 
 
 @dataclass(frozen=True)
-class Config(RecipeConfig):
+class LoamConfig(RecipeConfig):
     """Static settings of A-LOAM."""
 
     map: MapConfig = section(MapConfig, capacity=65536)
     registration: RegistrationConfig = section(RegistrationConfig, max_iterations=4)
     knn: KnnConfig = section(KnnConfig)
     features: LoamRingConfig = section(LoamRingConfig, rings=0, columns=0, surface_points=0)
-    loam: LoamConfig = section(LoamConfig)
+    loam: LoamSizes = section(LoamSizes)
 
 
 class Targets(eqx.Module):
@@ -118,7 +118,7 @@ class Targets(eqx.Module):
     """In the lidar frame of the last scan's middle."""
 
 
-class State(recipe.State):
+class LoamState(recipe.State):
     """What is carried from scan to scan."""
 
     nav: NavState
@@ -135,19 +135,19 @@ class State(recipe.State):
     """Number of scans with points so far."""
     map: Targets
 
-    def with_velocity_of(self, found: "State") -> "State":
+    def with_velocity_of(self, found: "LoamState") -> "LoamState":
         """Return this first state with the velocity of a later one."""
         return eqx.tree_at(lambda state: state.twist, self, found.twist)
 
 
-class Loam(Recipe[Config, Params, State]):
+class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
     """LOAM as A-LOAM implements it."""
 
     needs = Needs(imu="unused", rings=True)
-    config_type = Config
-    params_type = Params
+    config_type = LoamConfig
+    params_type = LoamParams
 
-    def init(self, params: Params, imu: ImuBatch | None = None) -> State:
+    def init(self, params: LoamParams, imu: ImuBatch | None = None) -> LoamState:
         """Return the state before the first scan: at the world's origin, with an empty map.
 
         Args:
@@ -161,7 +161,7 @@ class Loam(Recipe[Config, Params, State]):
         dtype = nav.velocity.dtype
         start = nav.T_world_imu @ nav.T_imu_lidar
         corners = features.corners * features.sectors * features.rings
-        return State(
+        return LoamState(
             nav=nav,
             T_odom_lidar=jaxlie.SE3(jnp.array([1, 0, 0, 0, 0, 0, 0], dtype)),
             T_map_odom=jaxlie.SE3(start.wxyz_xyz),
@@ -175,8 +175,8 @@ class Loam(Recipe[Config, Params, State]):
         )
 
     def step(
-        self, params: Params, state: State, scan: Scan, imu: ImuBatch | None = None
-    ) -> tuple[State, Output]:
+        self, params: LoamParams, state: LoamState, scan: Scan, imu: ImuBatch | None = None
+    ) -> tuple[LoamState, Output]:
         """Match one scan with the last one, then with the map, and add it to the map.
 
         Args:
@@ -251,7 +251,7 @@ class Loam(Recipe[Config, Params, State]):
             of_odometry,
             (state.T_odom_lidar, motion.to_end, state.map.last),
         )
-        new_state = State(
+        new_state = LoamState(
             nav=nav,
             T_odom_lidar=of_odometry[0],
             T_map_odom=jaxlie.SE3((T @ T_odom_lidar.inverse()).wxyz_xyz),
@@ -294,8 +294,8 @@ class _Compensated(eqx.Module):
 
 
 def _mapped(
-    config: Config,
-    params: Params,
+    config: LoamConfig,
+    params: LoamParams,
     cubes: FeatureMap,
     points: FeaturePoints,
     guess: jaxlie.SE3,
@@ -328,7 +328,9 @@ def _mapped(
     )
 
 
-def _last(config: Config, features: LoamFeatures, motion: TrialMotion, T_last_lidar: jaxlie.SE3) -> LastScan:
+def _last(
+    config: LoamConfig, features: LoamFeatures, motion: TrialMotion, T_last_lidar: jaxlie.SE3
+) -> LastScan:
     """Return what the next scan is matched with."""
     clouds = features.less_sharp, features.less_flat
     points = _Compensated(*clouds, motion, config.loam.compensate)(T_last_lidar)

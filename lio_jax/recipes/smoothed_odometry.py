@@ -14,7 +14,7 @@ from lio_jax.estimation.motion_state import DOF, POSE_DOF, MotionState
 from lio_jax.estimation.params import SmootherParams
 from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.estimation.sliding_window import Added, Window, open_window, still_link
-from lio_jax.recipes.lio_sam_params import Config, Params
+from lio_jax.recipes.lio_sam_params import LioSamConfig, LioSamParams
 from lio_jax.registration.gauss_newton import Registration
 
 
@@ -74,7 +74,7 @@ def measured_attitude(
 
 
 def opened(
-    config: Config, params: Params, nav: NavState, position_sigma: Float[Array, ""] | None = None
+    config: LioSamConfig, params: LioSamParams, nav: NavState, position_sigma: Float[Array, ""] | None = None
 ) -> Window:
     """Return the window with one state, around which ``params.initial`` says how far the truth may lie.
 
@@ -108,8 +108,8 @@ def opened(
 
 
 def match_as_measurement(
-    config: Config,
-    params: Params,
+    config: LioSamConfig,
+    params: LioSamParams,
     T_world_imu: jaxlie.SE3,
     match: Registration,
     arm_squared: Float[Array, ""],
@@ -144,7 +144,7 @@ def match_as_measurement(
     return PoseMeasurement(T_world_imu, information, params.smoother.kernel, there)
 
 
-def runs_away(state: MotionState, params: Params) -> Bool[Array, ""]:
+def runs_away(state: MotionState, params: LioSamParams) -> Bool[Array, ""]:
     """Return whether velocity or biases are beyond ``params.limits``, or not finite."""
     limits = params.limits
     sizes = (

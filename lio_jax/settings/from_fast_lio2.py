@@ -8,7 +8,7 @@ from typing import Any
 
 from lio_jax.core.errors import UsageError
 from lio_jax.core.leaf import numbers_of
-from lio_jax.recipes.fast_lio2 import IMU_RATE, Params, density_of
+from lio_jax.recipes.fast_lio2 import IMU_RATE, FastLio2Params, density_of
 from lio_jax.settings.foreign_rules import (
     Rule,
     System,
@@ -64,7 +64,7 @@ def _updates(value: Any, place: str) -> int:
 
 def _estimated(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
     if flag(value, place):
-        own = numbers_of(Params)["initial"]
+        own = numbers_of(FastLio2Params)["initial"]
         return {
             path: own[path.rpartition(".")[2]] for path in _ESTIMATED
         }, "estimated where the sigma is not zero"

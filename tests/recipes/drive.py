@@ -12,15 +12,15 @@ from scipy.linalg import expm
 from lio_jax.core.leaf import numbers_of, traced
 from lio_jax.core.types import Scan
 from lio_jax.mapping.params import MapConfig
-from lio_jax.recipes.default import Default, State
-from lio_jax.recipes.default_params import Config, Params, ThinnedScanConfig
+from lio_jax.recipes.default import Default, DefaultState
+from lio_jax.recipes.default_params import DefaultConfig, DefaultParams, ThinnedScanConfig
 from lio_jax.recipes.recipe import Output
 from lio_jax.sim.assembly import assembled
 from lio_jax.sim.lidar import column_times, spinning_lidar, sweep
 from lio_jax.sim.worlds import Counts, World, nearest_part
 
 PERIOD, BEAMS, COLUMNS = 0.1, 16, 256
-CONFIG = Config(
+CONFIG = DefaultConfig(
     lidar=ThinnedScanConfig(buckets=(BEAMS * COLUMNS,), registration_points=2048, insertion_points=4096),
     map=MapConfig(capacity=16384),
 )
@@ -109,14 +109,14 @@ HALL = {
 """Settings that differ from the defaults: the hall is small, and so are the capacities."""
 
 
-def params_with(**paths: float | list[float]) -> Params:
+def params_with(**paths: float | list[float]) -> DefaultParams:
     """Return default parameters fit for the hall, with changes, for example ``map__reach=50.0``."""
-    values = {section: dict(leaves) for section, leaves in numbers_of(Params).items()}
+    values = {section: dict(leaves) for section, leaves in numbers_of(DefaultParams).items()}
     for path, value in {**HALL, **paths}.items():
         section, name = path.split("__")
         assert name in values[section]
         values[section][name] = value
-    return traced(Params, values)
+    return traced(DefaultParams, values)
 
 
 PARAMS = params_with()
@@ -124,7 +124,7 @@ STEP = jax.jit(Default(CONFIG).step)
 """Compiled once for all tests: parameters and scans are traced."""
 
 
-def initial(params: Params = PARAMS) -> State:
+def initial(params: DefaultParams = PARAMS) -> DefaultState:
     return Default(CONFIG).init(params)
 
 
@@ -132,7 +132,7 @@ def initial(params: Params = PARAMS) -> State:
 class Step:
     """The results of one step."""
 
-    state: State
+    state: DefaultState
     output: Output
 
     @property
@@ -141,7 +141,7 @@ class Step:
         return np.asarray(self.state.nav.T_world_imu.as_matrix())
 
 
-def run(scans: list[Scan], params: Params = PARAMS) -> list[Step]:
+def run(scans: list[Scan], params: DefaultParams = PARAMS) -> list[Step]:
     """Feed scans one after another."""
     state, steps = initial(params), []
     for item in scans:

@@ -15,7 +15,7 @@ from lio_jax.lidar.features import FeatureCloud
 from lio_jax.mapping.feature_map import FeaturePoints, Submap, empty_feature_map
 from lio_jax.mapping.keyframes import no_keyframes
 from lio_jax.recipes import lio_sam_stages as stages
-from lio_jax.recipes.lio_sam_stages import Clock, Features, MapMatch, State
+from lio_jax.recipes.lio_sam_stages import Clock, Features, LioSamState, MapMatch
 from lio_jax.recipes.smoothed_odometry import opened
 from lio_jax.registration.gauss_newton import Registration
 from lio_jax.settings.settings import recipe_settings, with_overrides
@@ -45,13 +45,13 @@ def pose(translation, turn=(0.0, 0.0, 0.0)) -> jaxlie.SE3:
     return jaxlie.SE3.from_rotation_and_translation(rotation, jnp.asarray(translation, jnp.float64))
 
 
-def state(T_world_imu=None, velocity=SPEED, scans=5, time=1.0, matched_at=0.9) -> State:
+def state(T_world_imu=None, velocity=SPEED, scans=5, time=1.0, matched_at=0.9) -> LioSamState:
     """Return a state whose smoother agrees with its navigation state."""
     nav = initial_nav_state(PARAMS.extrinsics.T_imu_lidar(), GRAVITY)
     T_world_imu = pose(START) if T_world_imu is None else T_world_imu
     nav = replace(nav, T_world_imu=T_world_imu, velocity=jnp.asarray(velocity))
     keyframes = no_keyframes(CONFIG.lio_sam.keyframes, CORNERS, SURFACES, jnp.dtype(jnp.float64))
-    return State(
+    return LioSamState(
         nav=nav,
         window=opened(CONFIG, PARAMS, nav),
         time=jnp.asarray(time),
@@ -129,7 +129,7 @@ def match(T_world_imu, used=True, lost=False) -> MapMatch:
     return MapMatch(registration, T_world_imu, jnp.array(used), jnp.array(lost))
 
 
-def mapped(T_world_lidar=None) -> State:
+def mapped(T_world_lidar=None) -> LioSamState:
     """Return a state whose map holds the room, as a keyframe at a pose of the sensor."""
     before, sensor = state(), T_world_lidar or pose([0.2, 0.1, 0.0])
     added = _keyframe(
@@ -202,11 +202,13 @@ def test_features_are_moved_to_where_the_sensor_was_at_the_end():
 
 
 @pytest.fixture(scope="module")
-def with_map() -> State:
+def with_map() -> LioSamState:
     return mapped()
 
 
-def matched_from(before: State, truth: jaxlie.SE3, off: jaxlie.SE3, params=PARAMS, enough=True, **times):
+def matched_from(
+    before: LioSamState, truth: jaxlie.SE3, off: jaxlie.SE3, params=PARAMS, enough=True, **times
+):
     """Return the match of the room seen from a pose of the IMU, predicted wrongly."""
     points = seen_from(truth @ before.nav.T_imu_lidar, room())
     guess = jaxlie.SE3((truth @ off).wxyz_xyz)
@@ -256,7 +258,7 @@ def test_height_is_cut_off_at_its_limit(with_map):
     assert float(lidar.translation()[2]) == pytest.approx(0.01, abs=1e-3)
 
 
-def smoothed_from(before: State, found: MapMatch, imu=None, now=None):
+def smoothed_from(before: LioSamState, found: MapMatch, imu=None, now=None):
     now, imu = now or clock(), imu or samples()
     return _smooth(PARAMS, before, now, room(), stages.predict(before, now, imu), imu, found)
 
@@ -304,7 +306,7 @@ def test_the_first_scan_leaves_the_window_as_it_is():
 
 
 def added_at(
-    before: State, T_world_lidar: jaxlie.SE3, found: MapMatch, *, now=None, enough=True, failed=False
+    before: LioSamState, T_world_lidar: jaxlie.SE3, found: MapMatch, *, now=None, enough=True, failed=False
 ):
     nav = replace(before.nav, T_world_imu=T_world_lidar @ before.nav.T_imu_lidar.inverse())
     points, now = seen_from(T_world_lidar, room()), now or clock()

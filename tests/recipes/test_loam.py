@@ -64,7 +64,7 @@ def run(
     change=lambda number, scan: scan,
     count: int = SCANS,
     config: Config = CONFIG,
-    start: loam.State | None = None,
+    start: loam.LoamState | None = None,
 ):
     """Return states and outputs of each scan, and T_world_imu."""
     init, step = programs(config)

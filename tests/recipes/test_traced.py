@@ -10,7 +10,7 @@ import pytest
 from lio_jax.core.leaf import numbers_of, traced
 from lio_jax.core.types import state_dtype
 from lio_jax.recipes.default import Default
-from lio_jax.recipes.default_params import Params
+from lio_jax.recipes.default_params import DefaultParams
 from tests.recipes.drive import (
     CONFIG,
     PARAMS,
@@ -23,7 +23,7 @@ from tests.recipes.drive import (
     scan,
 )
 
-PATHS = [f"{section}__{name}" for section, leaves in numbers_of(Params).items() for name in leaves]
+PATHS = [f"{section}__{name}" for section, leaves in numbers_of(DefaultParams).items() for name in leaves]
 
 SETS = [
     {},
@@ -38,7 +38,7 @@ SETS = [
 
 
 def test_every_leaf_has_a_path():
-    assert len(PATHS) == len(jax.tree.leaves(traced(Params)))
+    assert len(PATHS) == len(jax.tree.leaves(traced(DefaultParams)))
 
 
 @pytest.mark.parametrize("path", PATHS)
