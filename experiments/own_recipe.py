@@ -21,7 +21,7 @@ from lio_jax.lidar.params import BeamParams, ScanConfig
 from lio_jax.lidar.thinning import thinned
 from lio_jax.mapping.params import VoxelMapParams
 from lio_jax.mapping.voxel_map import VoxelMap, empty_map, insert
-from lio_jax.recipes.inertial_filter import corrected, levelled_start, lidar_pose, predicted, registration_of
+from lio_jax.recipes import inertial_filter as inertial
 from lio_jax.registration.params import RobustFilterMatch, ThinnedMatch
 from lio_jax.registration.scan_match import FixedPoints
 from lio_jax.registration.voxel_planes import ScanToVoxels
@@ -72,23 +72,24 @@ class OwnRecipe(Recipe[Config, Params, Carried]):
     config_type, params_type, needs = Config, Params, Needs(imu="required")
 
     def init(self, params: Params, imu: ImuBatch | None = None) -> Carried:
-        start = levelled_start(params, imu)
+        start = inertial.levelled_start(params, imu)
         return Carried(start.nav, start.covariance, jnp.int32(0), empty_map(self.config.map.capacity))
 
     def step(self, params: Params, state: Carried, scan: Scan, imu: ImuBatch | None = None):
         first, sizes, spacing = state.scans == 0, self.config.lidar.points, params.registration.point_spacing
         thin = thinned(params.lidar, scan, params.map.point_spacing, spacing, sizes, sizes)
-        prior, path = predicted(params, NavEstimate(state.nav, state.covariance), scan, imu, first)
+        prior, path = inertial.predicted(params, NavEstimate(state.nav, state.covariance), scan, imu, first)
         points = deskew_along(path, prior.nav.T_imu_lidar, thin.points, thin.time)
         to_match, opening = FixedPoints(points[thin.matched.index]), jnp.where(state.scans < 3, 2.0, 0.2)
-        match = ScanToVoxels(to_match, lidar_pose(prior.nav), params.registration, state.map,
+        match = ScanToVoxels(to_match, inertial.lidar_pose(prior.nav), params.registration, state.map,
                              thin.matched.mask, opening, params.map, params.lidar)  # fmt: skip
-        update, matched = corrected(prior, match, self.config.registration.max_iterations)
+        update, matched = inertial.corrected(prior, match, self.config.registration.max_iterations)
         nav, lost, frame = update.state.nav, (update.status > ITERATION_LIMIT) & ~first, match.frame()
-        _, placed = jax.lax.stop_gradient(frame.place(points, lidar_pose(matched)))
+        _, placed = jax.lax.stop_gradient(frame.place(points, inertial.lidar_pose(matched)))
         reach = params.map.voxel_size.astype(jnp.float32), params.map.reach.astype(jnp.float32)
         vmap, added = insert(state.map, placed, thin.mask & ~lost, frame.anchor, *reach)
-        found, innovation = registration_of(update, lidar_pose(nav)), update.innovation
+        found, innovation = inertial.registration_of(update, inertial.lidar_pose(nav)), update.innovation
         return Carried(nav, update.state.covariance, state.scans + jnp.any(thin.mask), vmap), Output(
             found, lost, innovation.nis, innovation.dof, placed, thin.mask, added.added, frame.origin,
-            thin.dropped, added.dropped, covariance=update.state.covariance)  # fmt: skip
+            thin.dropped, added.dropped, covariance=update.state.covariance,
+            evidence=inertial.evidence_of(update, prior))  # fmt: skip

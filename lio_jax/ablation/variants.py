@@ -89,11 +89,10 @@ def _settings(recipe: str, common: Overrides, overrides: Overrides, folder: Path
         beside = folder / chosen
         settings = load_settings(beside if beside.exists() else Path(chosen))
     else:
-        own = folder / chosen
+        file, colon, _ = chosen.rpartition(":")
         # a recipe in a file is looked for next to the specification first
-        settings = recipe_settings(
-            str(own) if own.with_name(own.name.rpartition(":")[0]).is_file() else chosen
-        )
+        beside_spec = bool(colon) and (folder / file).is_file()
+        settings = recipe_settings(str(folder / chosen) if beside_spec else chosen)
     # what is set for all variants holds for those whose recipe reads it
     known = declared_settings(settings.recipe)
     elsewhere = every_path() - set(known)

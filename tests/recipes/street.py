@@ -48,12 +48,13 @@ def ate(poses: np.ndarray) -> float:
 def arrays(config: Config, inertial: bool):
     """Return each scan's padded arrays and its samples, and the samples before the first; else None."""
     _, scans, imu = recording()
-    feed, last, inputs = ImuFeed(imu, config.imu.buckets, 0.0, 0.0), None, []
+    feed = ImuFeed(imu, config.imu.buckets, 0.0, 0.0) if inertial else None
+    last, inputs = None, []
     for scan in scans:
-        samples = feed.batch(scan, last) if inertial else None
+        samples = feed.batch(scan, last) if feed else None
         inputs.append(jax.tree.map(jnp.asarray, (padded(scan, last, config.lidar), samples)))
         last = scan.end_ns
-    return inputs, jax.tree.map(jnp.asarray, feed.before(scans[0])) if inertial else None
+    return inputs, jax.tree.map(jnp.asarray, feed.before(scans[0])) if feed else None
 
 
 @dataclass(frozen=True)
