@@ -5,12 +5,11 @@ finds the velocities, gravity and the accelerometer's bias from their positions.
 state with its covariance in a level world.
 """
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
+import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from lio_jax.core.error_state import (
@@ -33,8 +32,10 @@ from lio_jax.imu.params import ImuParams, InitialParams
 from lio_jax.imu.preintegration import Preintegrated, preintegrate_parallel
 from lio_jax.imu.sampling import sample_intervals
 
-SPHERE_ROUNDS = 4
-"""Gauss-Newton iterations of :func:`align`; after each, gravity is scaled to its known magnitude."""
+MAX_STEPS = 16
+"""Largest number of Levenberg-Marquardt steps of :func:`align`."""
+PRECISION = 1e-5
+"""Change of the unknowns and of the cost, relative and absolute, below which :func:`align` stops."""
 
 
 class Scale(eqx.Module):
@@ -140,14 +141,14 @@ def align(
     speed_by_bias = gained_frame @ gain.bias_jacobian[:, VELOCITY, 3:]
     way_by_bias = gained_frame @ gain.bias_jacobian[:, POSITION, 3:]
 
-    def misfit(x: Aligned) -> tuple[Float[Array, " r"], Float[Array, ""]]:
+    def misfit(x: Aligned) -> Float[Array, " r"]:
         bias = scale.accel_bias * x.accel_share
         gained = gain.velocity + speed_by_bias @ bias
         moved = gain.position + way_by_bias @ bias
         speed = x.velocity[1:] - x.velocity[:-1] - x.gravity * dt - jnp.einsum("nij,nj->ni", turn, gained)
         way = x.position[1:] - x.position[:-1] - x.velocity[:-1] * dt - x.gravity * dt**2 / 2
         way = way - jnp.einsum("nij,nj->ni", turn, moved) - speed * dt / 2
-        rows = jnp.concatenate(
+        return jnp.concatenate(
             [
                 ((x.position - matched) / scale.pose).ravel(),
                 (speed / scale.speed[:, None]).ravel(),
@@ -155,31 +156,31 @@ def align(
                 x.accel_share,
             ]
         )
-        return rows, jnp.sum(rows[:-3] ** 2)
-
-    def of_known_strength(x: Aligned) -> Aligned:
-        strength = jnp.maximum(jnp.linalg.norm(x.gravity), jnp.finfo(dt.dtype).tiny)
-        return eqx.tree_at(lambda s: s.gravity, x, x.gravity * (gravity_strength / strength))
-
-    size = 2 * matched.size + 5
-
-    def round_of(x: Aligned, _: None) -> tuple[Aligned, Float[Array, "c c"]]:
-        axes = -skew(x.gravity) @ axes_across(x.gravity)
-        step, covariance = _least_squares(lambda d: misfit(_moved(x, d, axes))[0], size, dt.dtype)
-        return of_known_strength(_moved(x, step, axes)), covariance
 
     mean_velocity = jnp.diff(matched, axis=0) / dt
     elapsed = jnp.sum(duration) - (duration[0] + duration[-1]) / 2
     acceleration = (mean_velocity[-1] - mean_velocity[0]) / jnp.maximum(elapsed, duration[0])
-    force = jnp.mean(jnp.einsum("nij,nj->ni", turn, gain.velocity) / dt, axis=0)
-    x = Aligned(
+    gravity = acceleration - jnp.mean(jnp.einsum("nij,nj->ni", turn, gain.velocity) / dt, axis=0)
+    strength = jnp.maximum(jnp.linalg.norm(gravity), jnp.finfo(dt.dtype).tiny)
+    start = Aligned(
         matched,
         jnp.concatenate([mean_velocity, mean_velocity[-1:]]),
         jnp.zeros(3, dt.dtype),
-        acceleration - force,
+        gravity * (gravity_strength / strength),
     )
-    x, covariances = jax.lax.scan(round_of, of_known_strength(x), None, SPHERE_ROUNDS)
-    return x, covariances[-1], misfit(x)[1]
+    zero = jnp.zeros(2 * matched.size + 5, dt.dtype)
+    # its steps are solved by QR: the normal equations would square a condition number that is high already
+    step = optx.least_squares(
+        lambda step, _: misfit(_moved(start, step)),
+        optx.LevenbergMarquardt(PRECISION, PRECISION),
+        zero,
+        max_steps=MAX_STEPS,
+        throw=False,
+    ).value
+    solved = _moved(start, step)
+    root = jnp.linalg.qr(jax.jacfwd(lambda step: misfit(_moved(solved, step)))(zero), mode="r")
+    inverse = jax.scipy.linalg.solve_triangular(root, jnp.eye(zero.size, dtype=dt.dtype))
+    return solved, inverse @ inverse.T, jnp.sum(misfit(solved)[:-3] ** 2)
 
 
 def axes_across(gravity: Float[Array, "3"]) -> Float[Array, "3 2"]:
@@ -191,26 +192,15 @@ def axes_across(gravity: Float[Array, "3"]) -> Float[Array, "3 2"]:
     return jnp.stack([a, jnp.cross(up, a)], axis=1)
 
 
-def _moved(x: Aligned, step: Float[Array, " c"], axes: Float[Array, "3 g"]) -> Aligned:
-    """Return the unknowns after a step, whose last entries move gravity along ``axes``."""
+def _moved(x: Aligned, step: Float[Array, " c"]) -> Aligned:
+    """Return the unknowns after a step, whose last two entries rotate gravity about axes normal to it."""
     poses = x.position.size
     return Aligned(
         x.position + step[:poses].reshape(-1, 3),
         x.velocity + step[poses : 2 * poses].reshape(-1, 3),
         x.accel_share + step[2 * poses : 2 * poses + 3],
-        x.gravity + axes @ step[2 * poses + 3 :],
+        jaxlie.SO3.exp(axes_across(x.gravity) @ step[2 * poses + 3 :]) @ x.gravity,
     )
-
-
-def _least_squares(
-    misfit: Callable[[Float[Array, " c"]], Float[Array, " r"]], size: int, dtype: jnp.dtype
-) -> tuple[Float[Array, " c"], Float[Array, "c c"]]:
-    """Return the step that solves a linear least-squares problem, and the solution's covariance."""
-    zero = jnp.zeros(size, dtype)
-    # by QR, because the normal equations would square a condition number that is high already
-    q, r = jnp.linalg.qr(jax.jacfwd(misfit)(zero))
-    inverse = jax.scipy.linalg.solve_triangular(r, jnp.eye(size, dtype=dtype))
-    return -(inverse @ (q.T @ misfit(zero))), inverse @ inverse.T
 
 
 GYRO_ROUNDS = 3

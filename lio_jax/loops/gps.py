@@ -10,10 +10,13 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from lio_jax.core.xla import programs
 from lio_jax.pose_graph.graduated import truncated_weights
 
 _Array = NDArray[np.float64]
@@ -26,8 +29,11 @@ _GROWTH = 1.4
 """Factor of the control parameter from one set of weights to the next."""
 _ROUNDS = 100
 """Largest number of sets of weights."""
-_STEPS = 3
-"""Number of Gauss-Newton steps after the closed form."""
+_STEPS = 16
+"""Largest number of Levenberg-Marquardt steps after the closed form."""
+_PRECISION = 1e-9
+"""Change of the yaw (rad), of the translation (m) and of the cost, relative and absolute, below which the
+solver stops."""
 _SETTLED = 1e-3
 """Distance from 0 or 1 below which a weight counts as final."""
 _MOST_ALIKE = 0.98
@@ -127,19 +133,39 @@ def _robust(pairs: _Pairs) -> tuple[float, _Array, _Array]:
 
 
 def _solved(pairs: _Pairs, weights: _Array) -> tuple[float, _Array]:
-    """Return yaw and translation by least squares: closed form for round covariances, then Gauss-Newton."""
+    """Return yaw and translation by least squares.
+
+    The start is the closed form for covariances that are equal in east and north.
+    """
     p, f = pairs.odometry, pairs.fix
     share = weights * np.sum(pairs.root[:, :2, :2] ** 2, axis=(1, 2))
     share = share / share.sum()
     (x, y, _), (east, north, _) = (p - share @ p).T, (f - share @ f).T
     yaw = float(np.arctan2(share @ (x * north - y * east), share @ (x * east + y * north)))
     shift = share @ f - _about_z(yaw) @ (share @ p)
-    root = np.sqrt(weights)[:, None]
-    for _ in range(_STEPS):
-        A = (root[:, :, None] * pairs.slope(yaw)).reshape(-1, 4)
-        step = np.linalg.lstsq(A, -(root * pairs.residual(yaw, shift)).ravel(), rcond=None)[0]
-        yaw, shift = yaw + float(step[0]), shift + step[1:]
-    return yaw, shift
+    root = np.sqrt(weights)[:, None, None] * pairs.root
+    # a program is compiled for a shape: lengths are rounded up to powers of two by pairs without weight
+    lacking = (1 << (len(p) - 1).bit_length()) - len(p)
+    padded = [np.pad(part, [(0, lacking)] + [(0, 0)] * (part.ndim - 1)) for part in (p, f, root)]
+    with jax.enable_x64(True):
+        found = programs(_refined)(np.array([yaw, *shift]), *padded)
+    return float(found[0]), np.array(found[1:])
+
+
+def _refined(start: jax.Array, odometry: jax.Array, fix: jax.Array, root: jax.Array) -> jax.Array:
+    """Return the yaw and translation (4,) that minimise the sum of squares of root' (Rz(yaw) p + t - f)."""
+    import optimistix as optx  # takes 0.3 s, and only recordings with fixes need it
+
+    def misfit(x: jax.Array, _: None) -> jax.Array:
+        cosine, sine = jnp.cos(x[0]), jnp.sin(x[0])
+        east = cosine * odometry[:, 0] - sine * odometry[:, 1]
+        north = sine * odometry[:, 0] + cosine * odometry[:, 1]
+        missed = jnp.stack([east, north, odometry[:, 2]], axis=-1) + x[1:] - fix
+        return jnp.einsum("kji,kj->ki", root, missed)
+
+    return optx.least_squares(
+        misfit, optx.LevenbergMarquardt(_PRECISION, _PRECISION), start, max_steps=_STEPS, throw=False
+    ).value
 
 
 def _covariance(pairs: _Pairs, inlier: NDArray[np.bool_], yaw: float, shift: _Array) -> _Array | None:
