@@ -102,8 +102,8 @@ def comparison(shop: Workshop, scored: Found, options: argparse.Namespace) -> li
     print(f"\nbest loss by scans processed, {world} {seed} from {factor:g} x")
     print(f"{'scans':>8}{'scoring':>12}{'simplex':>12}")
     for place, loss in enumerate(np.minimum.accumulate(scored.losses)):
-        beside = course[min(place, len(course) - 1)][1]
-        print(f"{(place + 1) * length:8d}{loss:12.4f}{beside:12.4f}")
+        nearest = course[min(place, len(course) - 1)][1]
+        print(f"{(place + 1) * length:8d}{loss:12.4f}{nearest:12.4f}")
     return course
 
 

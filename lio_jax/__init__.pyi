@@ -20,6 +20,9 @@ from .lidar.features import lio_sam_features as lio_sam_features
 from .lidar.features import loam_features as loam_features
 from .mapping.frame import Frame as Frame
 from .mapping.voxel_map import anchor_of as anchor_of
+from .pose_graph.g2o import read_g2o as read_g2o
+from .pose_graph.graph import PoseGraph as PoseGraph
+from .pose_graph.pose_derivative import solved_poses as solved_poses
 from .recipes.inertial_filter import lidar_pose as lidar_pose
 from .recipes.inertial_filter import predicted as predicted
 from .recipes.params import ExtrinsicsParams as ExtrinsicsParams

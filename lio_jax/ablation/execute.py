@@ -14,7 +14,7 @@ from lio_jax.ablation.spec import load_spec
 from lio_jax.ablation.store import Store, opened
 from lio_jax.ablation.tasks import Task, pieces, tasks_of
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data.whole_output import disk_errors_said
+from lio_jax.data.whole_output import named_disk_errors
 from lio_jax.run.folder import write_text
 
 Perform = Callable[[tuple[Task, ...], Store], None]
@@ -132,7 +132,7 @@ def run_ablation(spec_path: Path, out: Path) -> Comparison:
     spec = load_spec(spec_path)
     tasks = tasks_of(spec)
     with opened(out) as store:
-        with disk_errors_said(out / "spec.yaml"):
+        with named_disk_errors(out / "spec.yaml"):
             write_text(out / "spec.yaml", spec.text)
         for piece in pieces(tasks, 1):
             perform(piece, store)

@@ -41,9 +41,9 @@ class Recorded:
         """Return the properties that the result depends on: each file's name, size and time of change."""
         path = Path(self.path)
         files = sorted(entry for entry in path.rglob("*") if entry.is_file()) if path.is_dir() else [path]
-        beside = [Path(self.truth_file)] if self.truth_file else pose_files(path)
+        truths = [Path(self.truth_file)] if self.truth_file else pose_files(path)
         digest = hashlib.sha256()
-        for file in [*files, *beside]:
+        for file in [*files, *truths]:
             if file.exists():
                 name = file.relative_to(path) if path in file.parents else file.name
                 status = file.stat()

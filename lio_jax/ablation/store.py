@@ -16,7 +16,7 @@ from lio_jax.ablation.spec import numbers_in
 from lio_jax.ablation.tasks import Task, code_version
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.core.files import atomic_path, folder_lock
-from lio_jax.data.whole_output import disk_errors_said, written_whole
+from lio_jax.data.whole_output import named_disk_errors, written_whole
 from lio_jax.run.folder import processor, usable_cores, write_json
 from lio_jax.settings.settings import Settings
 
@@ -72,7 +72,7 @@ class Store:
     def fail(self, key: str, run: str, reason: str, traceback: str = "") -> None:
         """Record why a task failed."""
         path = self.root / "failed" / f"{key}.json"
-        with _disk_errors(), disk_errors_said(path):
+        with _disk_errors(), named_disk_errors(path):
             path.parent.mkdir(exist_ok=True)
             write_json(path, {"run": run, "reason": reason, "traceback": traceback})
 

@@ -86,8 +86,8 @@ def variants(
 def _settings(recipe: str, common: Overrides, overrides: Overrides, folder: Path, place: str) -> Settings:
     chosen = str((common | overrides).get("recipe", recipe))
     if chosen.endswith((".yaml", ".yml")):
-        beside = folder / chosen
-        settings = load_settings(beside if beside.exists() else Path(chosen))
+        relative = folder / chosen
+        settings = load_settings(relative if relative.exists() else Path(chosen))
     else:
         file, colon, _ = chosen.rpartition(":")
         # a recipe in a file is looked for next to the specification first

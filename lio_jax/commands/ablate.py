@@ -24,7 +24,7 @@ from lio_jax.commands.runtime import prepare_jax, say
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory
-from lio_jax.data.whole_output import disk_errors_said
+from lio_jax.data.whole_output import named_disk_errors
 from lio_jax.run.folder import write_text
 from lio_jax.settings.settings import Settings
 
@@ -40,7 +40,7 @@ def ablate(spec_path: Path, out: Path, scheduler: str, report: bool, retry_faile
     tasks = tasks_of(spec)
     keys = [task.key for task in tasks]
     with opened(out) as store:
-        with disk_errors_said(out / "spec.yaml"):
+        with named_disk_errors(out / "spec.yaml"):
             write_text(out / "spec.yaml", spec.text)
         if retry_failed:
             store.forget_failures(store.failed(keys))
@@ -79,7 +79,7 @@ def _conclude(spec: Spec, tasks: list[Task], store: Store, report: bool) -> None
     comparison = compare(spec, tasks, store)
     page = store.root / "report.html"
     if report:
-        with disk_errors_said(page):
+        with named_disk_errors(page):
             write_report(comparison, store)
     print(as_text(comparison))
     print(f"\nruns       {store.root / 'tasks'}")
@@ -96,7 +96,7 @@ def _conclude(spec: Spec, tasks: list[Task], store: Store, report: bool) -> None
 
 
 _REASONS_SHOWN = 5
-_SAID_EVERY = 0.1
+_REPORT_EVERY = 0.1
 
 
 @contextmanager
@@ -112,14 +112,14 @@ def _progress(total: int, ended: int) -> Iterator[Callable[[int, int], None]]:
 
             yield show
         return
-    began, said = time.monotonic(), ended
+    began, reported = time.monotonic(), ended
 
     def tell(done: int, failed: int) -> None:
-        nonlocal said
+        nonlocal reported
         now = done + failed
-        if now - said < _SAID_EVERY * total and not (now == total > said):
+        if now - reported < _REPORT_EVERY * total and not (now == total > reported):
             return
-        said = now
+        reported = now
         left_s = (time.monotonic() - began) / max(now - ended, 1) * (total - now)
         say(f"{now} of {total} runs ended, {failed} failed, about {_duration(left_s)} left")
 

@@ -50,8 +50,8 @@ def calibrate_imu(data: Path, out: Path, plot: Path | None, skip: float) -> None
         raise UsageError(f"--out {out}: give a file that ends in .yaml, as --recipe wants it.")
     if plot is not None and plot.suffix != ".png":
         raise UsageError(f"--plot {plot}: give a file that ends in .png.")
-    imu, said = cleaned(imu_of(data), str(data))
-    for sentence in said:
+    imu, messages = cleaned(imu_of(data), str(data))
+    for sentence in messages:
         say(f"warning: {sentence}")
     imu, seconds = _at_rest(imu, data, skip)
     noises = {key: sensor_noise(getattr(imu, key), seconds) for _, key, _ in _SENSORS}

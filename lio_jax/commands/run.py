@@ -96,13 +96,13 @@ def mapping_table(foreign: ForeignSettings, settings: Settings) -> str:
     lines = [f"{foreign.source}: {system.name}'s parameters, recipe {recipe}"]
     for entry in taken:
         lines.append(
-            f"  {entry.key:{width}}  {_short(entry.value)} -> {_ours(entry, settings)}{_said(entry.word)}"
+            f"  {entry.key:{width}}  {_short(entry.value)} -> {_ours(entry, settings)}{_comment(entry.word)}"
         )
     if left:
         lines.append("not taken:")
     for entry in left:
         why = f"of {system.name}'s method, not taken by the recipe {recipe}" if entry.settings else entry.word
-        lines.append(f"  {entry.key:{width}}  {_short(entry.value)}{_said(why)}")
+        lines.append(f"  {entry.key:{width}}  {_short(entry.value)}{_comment(why)}")
     return "\n".join(lines)
 
 
@@ -122,7 +122,7 @@ def _as_held(value: Any, final: Any) -> Any:
     return float(value) if isinstance(final, float) else value
 
 
-def _said(word: str) -> str:
+def _comment(word: str) -> str:
     return f"  ({word})" if word else ""
 
 
@@ -302,14 +302,14 @@ def _summary(result: RunResult, out: Path) -> str:
     )
 
 
-def _corrected(said: dict[str, Any]) -> list[str]:
-    loops, fixes = said["loops"], said["gps"]
+def _corrected(backend: dict[str, Any]) -> list[str]:
+    loops, fixes = backend["loops"], backend["gps"]
     refused = sum(loops["refused"].values())
     lines = [
         f"loops      {loops['closed']} closed, {loops['distrusted']} of them distrusted, {refused} refused"
     ]
     if fixes:
-        lines.append(f"GPS        {fixes['used']} of {said['keyframes']} keyframes have a fix")
+        lines.append(f"GPS        {fixes['used']} of {backend['keyframes']} keyframes have a fix")
     return lines
 
 

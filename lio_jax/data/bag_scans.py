@@ -148,9 +148,9 @@ def recognise_scans(
     if timing is not None:
         return ScanReading(timing, "start", timing.sweep, chosen_beams, (timing.note, *ring_note))
     period = scan_period(headers, config.scan_period)
-    stamp_at, said = stamp_end(samples, period, config) if samples else ("start", "no points in any message")
+    stamp_at, note = stamp_end(samples, period, config) if samples else ("start", "no points in any message")
     missing = f"field {first.time_field!r} holds a single value" if first.time_field else "not recorded"
-    time_note = f"per-point time: {missing}, reconstructed from azimuth over {period:.4g} s a scan, {said}"
+    time_note = f"per-point time: {missing}, reconstructed from azimuth over {period:.4g} s a scan, {note}"
     return ScanReading(None, stamp_at, period, chosen_beams, (time_note, *ring_note))
 
 

@@ -8,7 +8,8 @@ from lio_jax.core.leaf import static
 
 @dataclass(frozen=True)
 class DataConfig:
-    """How a recording is read; "auto" or an empty string means: recognised from the data, and said."""
+    """How a recording is read; "auto" or an empty string means that the value is recognised from the data and
+    printed."""
 
     lidar_topic: str = static("")
     """Bag topic of the point clouds; empty: the one with most messages."""

@@ -36,27 +36,29 @@ def cleaned(gps: GpsData, source: str) -> tuple[GpsData, tuple[str, ...]]:
             f"{source}: {count} GPS stamps, but positions of shape {gps.position.shape} and covariances of "
             f"shape {gps.covariance.shape}; write (n, 3) and (n, 3, 3)."
         )
-    said = []
+    messages = []
     possible = np.asarray((np.abs(gps.position) < _FARTHEST).all(axis=1))
     if not possible.all():
-        said.append(f"{np.sum(~possible)} GPS fix(es) without a possible position were left out.")
+        messages.append(f"{np.sum(~possible)} GPS fix(es) without a possible position were left out.")
     if not np.isfinite(gps.origin).all():
         unset = possible & ~gps.position[:, :2].any(axis=1)
         if unset.any():
-            said.append(f"{np.sum(unset)} GPS fix(es) at (0, 0) were left out: the receiver had none yet.")
+            messages.append(
+                f"{np.sum(unset)} GPS fix(es) at (0, 0) were left out: the receiver had none yet."
+            )
         possible &= ~unset
     gps = _at(gps, np.flatnonzero(possible))
     kept = np.array(ascending(gps.stamp_ns.tolist()), np.int64)
     if len(kept) < len(gps.stamp_ns):
-        said.append(
+        messages.append(
             f"{len(gps.stamp_ns) - len(kept)} GPS fix(es) whose stamp repeats, steps back or leaps ahead "
             "were left out."
         )
     gps = _at(gps, kept)
     covariance, unstated = with_covariances(gps.covariance)
     if unstated:
-        said.append(f"{unstated}.")
-    return replace(gps, covariance=covariance), tuple(f"{source}: {sentence}" for sentence in said)
+        messages.append(f"{unstated}.")
+    return replace(gps, covariance=covariance), tuple(f"{source}: {sentence}" for sentence in messages)
 
 
 def with_covariances(covariance: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:

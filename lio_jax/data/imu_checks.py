@@ -35,22 +35,22 @@ def cleaned(
     """
 
     origin = int(imu.stamp_ns[0]) if len(imu.stamp_ns) else 0
-    said: list[str] = []
-    imu = _only(imu, _finite(imu, said))
-    imu = _only(imu, _ascending(imu.stamp_ns, origin, said))
+    messages: list[str] = []
+    imu = _only(imu, _finite(imu, messages))
+    imu = _only(imu, _ascending(imu.stamp_ns, origin, messages))
     if len(imu.stamp_ns) == 0:
-        return imu, tuple(f"{source}: {sentence}" for sentence in [*said, "no IMU sample is left."])
+        return imu, tuple(f"{source}: {sentence}" for sentence in [*messages, "no IMU sample is left."])
     scale, note = accel_scale(imu.accel, DataConfig())
     imu = replace(imu, accel=imu.accel * scale)
     seconds = np.asarray((imu.stamp_ns - origin) * 1e-9, np.float64)
-    said += [
+    messages += [
         f"{note}." if note else "",
         gaps(imu.stamp_ns, origin),
         *saturation(imu, seconds),
         degrees_suspected(imu, seconds),
         gravity_sign(imu, seconds, T_imu_lidar),
     ]
-    return imu, tuple(f"{source}: {sentence}" for sentence in said if sentence)
+    return imu, tuple(f"{source}: {sentence}" for sentence in messages if sentence)
 
 
 STANDARD_GRAVITY = 9.80665
@@ -199,10 +199,10 @@ def _held(column: NDArray[np.float64], limit: float, lowest: float) -> NDArray[n
         return np.zeros(0, np.intp)
     others = column[column != limit]
     next_value = others.max() if limit > others.max() else others.min()
-    beside = np.count_nonzero(column == next_value)
+    next_to_it = np.count_nonzero(column == next_value)
     breaks = np.flatnonzero(np.diff(at) > 1)
     longest = np.diff(np.concatenate([[-1], breaks, [len(at) - 1]])).max()
-    return at if len(at) >= 3 * beside and longest >= _RUN else np.zeros(0, np.intp)
+    return at if len(at) >= 3 * next_to_it and longest >= _RUN else np.zeros(0, np.intp)
 
 
 def _windowed(
@@ -275,7 +275,7 @@ def _only(imu: ImuData, kept: NDArray[np.bool_]) -> ImuData:
     return ImuData(imu.stamp_ns[kept], imu.gyro[kept], imu.accel[kept], orientation)
 
 
-def _finite(imu: ImuData, said: list[str]) -> NDArray[np.bool_]:
+def _finite(imu: ImuData, messages: list[str]) -> NDArray[np.bool_]:
     values = np.hstack([imu.gyro, imu.accel])
     possible = np.asarray((np.abs(values) < LARGEST).all(axis=1))
     if not possible.all():
@@ -284,11 +284,13 @@ def _finite(imu: ImuData, said: list[str]) -> NDArray[np.bool_]:
         what = (
             "NaN or infinity" if not np.isfinite(values[bad]).all() else "a value beyond any sensor's range"
         )
-        said.append(f"{len(bad)} IMU sample(s) held {what}, the first at {seconds:.3f} s, and were dropped.")
+        messages.append(
+            f"{len(bad)} IMU sample(s) held {what}, the first at {seconds:.3f} s, and were dropped."
+        )
     return possible
 
 
-def _ascending(stamp_ns: NDArray[np.int64], origin_ns: int, said: list[str]) -> NDArray[np.bool_]:
+def _ascending(stamp_ns: NDArray[np.int64], origin_ns: int, messages: list[str]) -> NDArray[np.bool_]:
     steps = np.diff(stamp_ns)
     kept = np.ones(len(stamp_ns), bool)
     if np.all(steps > 0):
@@ -303,14 +305,14 @@ def _ascending(stamp_ns: NDArray[np.int64], origin_ns: int, said: list[str]) -> 
     at = int(np.argmax(steps < 0))
     if steps[at] < 0:
         seconds = (stamp_ns[at] - origin_ns) * 1e-9
-        said.append(
+        messages.append(
             f"the time of the IMU samples runs backwards {np.count_nonzero(steps < 0)} time(s), first at "
             f"{seconds:.3f} s by {-steps[at] * 1e-9:.3f} s: {np.count_nonzero(back)} sample(s) out of order "
             "were dropped and the rest is used."
         )
     if repeats.any():
         seconds = (stamp_ns[int(np.argmax(repeats))] - origin_ns) * 1e-9
-        said.append(
+        messages.append(
             f"{np.count_nonzero(repeats)} IMU sample(s) repeat a stamp, the first at {seconds:.3f} s: "
             "the first of each was kept."
         )

@@ -132,13 +132,13 @@ def recognise_point_time(
     tick_ns = TICK_NS[unit]
     sweep = spread * tick_ns * 1e-9
     anchor, where = _anchor(samples, tick_ns, absolute, sweep, config)
-    said = (
+    note = (
         f"per-point time: field {field!r}, {kind} {unit} {'absolute' if absolute else 'relative'}, "
         f"{sweep:.4f} s a scan, {where}"
     )
     if not 0.1 <= sweep / period <= 2.0:
-        said += f"; that does not fit the {period:.4g} s between scans, check config.data.time_unit"
-    return PointTiming(tick_ns, absolute, anchor, sweep, said)
+        note += f"; that does not fit the {period:.4g} s between scans, check config.data.time_unit"
+    return PointTiming(tick_ns, absolute, anchor, sweep, note)
 
 
 def stamp_end(
@@ -197,8 +197,8 @@ def _anchor(
                 else f"{place:.2f} of the scan"
             )
             return "points", f"header stamp at {'scan ' if word in ('start', 'end') else ''}{word}"
-        anchor, said = stamp_end(samples, sweep, config)
-        return anchor, f"{said}, points on another clock than the header ({np.median(offsets):+.3f} s)"
+        anchor, note = stamp_end(samples, sweep, config)
+        return anchor, f"{note}, points on another clock than the header ({np.median(offsets):+.3f} s)"
     low = float(np.median([s.low for s in samples])) * tick_ns * 1e-9
     high = float(np.median([s.high for s in samples])) * tick_ns * 1e-9
     if low < -0.02 * sweep:

@@ -53,7 +53,7 @@ def written_whole(path: Path, overwrite: bool = False, marker: str = "") -> Iter
     check_free(path, overwrite, marker)
     hidden = aside_of(path)
     try:
-        with disk_errors_said(path, hidden), ExitStack() as held:
+        with named_disk_errors(path, hidden), ExitStack() as held:
             hidden.mkdir(parents=True)
             # the lock shows the next writer that this process lives
             held.enter_context(folder_lock(hidden))
@@ -65,7 +65,7 @@ def written_whole(path: Path, overwrite: bool = False, marker: str = "") -> Iter
 
 
 @contextmanager
-def disk_errors_said(path: Path, written: Path | None = None) -> Iterator[None]:
+def named_disk_errors(path: Path, written: Path | None = None) -> Iterator[None]:
     """Turn the system's errors on writing ``path`` into one sentence.
 
     Args:

@@ -113,34 +113,3 @@ def innovation_of(
         dof=jnp.sum(observed).astype(jnp.int32),
         log_det=2 * jnp.sum(jnp.log(jnp.diagonal(factor))) - noise,
     )
-
-
-def innovation_log_likelihood(
-    squared_error: Float[Array, ""],
-    log_det_noise: Float[Array, ""],
-    count: Float[Array, ""] | Int32[Array, ""],
-    information: Float[Array, "k k"],
-    gradient: Float[Array, " k"],
-    covariance: Float[Array, "k k"],
-) -> Float[Array, ""]:
-    """Return the log-density of all residuals of a measurement, predicted with covariance H W H' + R.
-
-    The m x m covariance is never formed: by the matrix determinant lemma and Woodbury's identity, with
-    T = I + C'WC and C u = gradient, ``log|HWH' + R| = log|R| + log|T|`` and
-    ``r'(HWH' + R)^-1 r = r'R^-1 r - u'T^-1 C'W gradient``.
-
-    Args:
-        squared_error: r' R^-1 r of the residuals at the prior mean.
-        log_det_noise: log|R|.
-        count: number m of residuals.
-        information: H' R^-1 H, where H is the derivative of the residuals by the measured quantity.
-        gradient: H' R^-1 r.
-        covariance: prior covariance W = J P J' of the measured quantity.
-    """
-    root, along, values = square_root_information(information, gradient)
-    spread = covariance @ root
-    innovation = innovation_of(root.T @ spread, along, values)
-    explained = along @ innovation.solve((spread.T @ gradient)[:, None])[:, 0]
-    noise = jnp.sum(jnp.where(values > 0, jnp.log(jnp.where(values > 0, values, 1.0)), 0.0))
-    log_det = log_det_noise + innovation.log_det + noise
-    return -0.5 * (squared_error - explained + log_det + count * jnp.log(2 * jnp.pi))

@@ -39,7 +39,7 @@ class Update(NamedTuple):
 
     state: Any
     covariance: Float[Array, "d d"]
-    """Of the error at ``state``."""
+    """Covariance of the error at ``state``."""
     innovation: Innovation
     measurement: Measurement
     """The last linearisation, at the iterate before ``state``."""
@@ -192,7 +192,7 @@ class _Blend(eqx.Module):
 
     measured: Measurement
     H: Float[Array, "k d"]
-    """Of the whitened measurement by the error from the prior mean."""
+    """Derivative of the whitened measurement by the error from the prior mean."""
     PH: Float[Array, "d k"]
     innovation: Innovation
 

@@ -2,13 +2,11 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from lio_jax.core.error_state import DOF, EXTRINSIC_ROTATION, EXTRINSIC_TRANSLATION, POSITION, ROTATION
 from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
 from lio_jax.core.types import NavState
-from lio_jax.estimation.iterated_filter import Measurement
 
 
 def lidar_pose_jacobian(nav: NavState) -> Float[Array, "6 24"]:
@@ -102,25 +100,3 @@ def _decomposed(information: Array, gradient: Array, degeneracy_ratio: Array) ->
     kept = (vectors * jnp.where(degenerate, 0.0, values)) @ vectors.T
     along = vectors @ jnp.where(degenerate, 0.0, vectors.T @ gradient)
     return (kept, along, degenerate), values, vectors
-
-
-def measured_pose(nav: NavState, T_world_lidar: jaxlie.SE3, information: Float[Array, "6 6"]) -> Measurement:
-    """Return the measurement of the navigation state by a measured lidar pose.
-
-    Args:
-        nav: state at which to linearise.
-        T_world_lidar: the measured pose.
-        information: inverse covariance of its right perturbation, rotation (rad) before translation (m).
-    """
-    predicted = nav.T_world_imu @ nav.T_imu_lidar
-    missed = T_world_lidar.inverse() @ predicted
-    residual = jnp.concatenate([missed.rotation().log(), missed.translation()])
-    to_measured = rotation_matrix(T_world_lidar.rotation().inverse())
-    H = jnp.zeros((6, 6), residual.dtype)
-    # Exp(turn) on the left of the residual's rotation acts through its inverse left Jacobian
-    H = H.at[:3, :3].set(missed.rotation().inverse().jlog() @ to_measured).at[3:, 3:].set(to_measured)
-    return Measurement(
-        information=H.T @ information @ H,
-        gradient=H.T @ information @ residual,
-        lost=jnp.array(False),
-    )

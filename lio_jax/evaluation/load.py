@@ -76,9 +76,9 @@ def _kitti(path: Path) -> LoadedTrajectory:
 
 
 def _kitti_stamps(path: Path, count: int) -> NDArray[np.int64] | None:
-    beside = path.with_name(_RUN_TRAJECTORY)
-    if path.name == "trajectory_kitti.txt" and beside.is_file():
-        stamps = read_tum(beside).stamp_ns
+    with_stamps = path.with_name(_RUN_TRAJECTORY)
+    if path.name == "trajectory_kitti.txt" and with_stamps.is_file():
+        stamps = read_tum(with_stamps).stamp_ns
         if len(stamps) == count:
             return stamps
     for times in (path.with_name("times.txt"), path.parent.parent / "sequences" / path.stem / "times.txt"):

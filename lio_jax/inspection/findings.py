@@ -175,20 +175,22 @@ def suspicions(
             "clocks, units or axes differ, or the scans cannot be matched."
         )
         return [sentence], []
-    said, settings = [], []
+    messages, settings = [], []
     if not 0.8 < found.scale < 1.25:
-        said.append(f"the gyroscope's rates are {found.scale:.2f} times those of the scans: check its unit.")
+        messages.append(
+            f"the gyroscope's rates are {found.scale:.2f} times those of the scans: check its unit."
+        )
     if found.mirrored:
-        said.append(
+        messages.append(
             "the gyroscope's axes are a mirror image of the lidar's: one axis has the wrong sign, or two are "
             "exchanged; no T_imu_lidar can put that right, correct the recorded samples."
         )
     elif found.off_deg is not None:
         words, setting = _rotation(found, calibrated)
-        said += words
+        messages += words
         settings += setting
     words, setting = _clock(found, sweep, rate)
-    return said + words, settings + setting
+    return messages + words, settings + setting
 
 
 def _rotation(found: Agreement, calibrated: bool) -> tuple[list[str], list[Suggestion]]:
@@ -224,14 +226,14 @@ def _clock(found: Agreement, sweep: float | None, rate: float | None) -> tuple[l
     if sigma is None or abs(found.time_offset) < max(least, _SIGMAS * sigma):
         return [], []
     offset = round(found.time_offset, 3)
-    said = (
+    message = (
         f"the gyroscope's clock differs from the scans' by {offset:+.3f} s (sigma {sigma:.3f} s; a scan "
         f"stamped t was taken at IMU time t {offset:+.3f} s)."
     )
     if sweep and abs(abs(offset) - sweep) < _OTHER_END * sweep:
         end = "end" if offset < 0 else "start"
-        said += f" That is a sweep: the stamp may mark the scan's {end}, see config.data.stamp_at."
-    return [said], [
+        message += f" That is a sweep: the stamp may mark the scan's {end}, see config.data.stamp_at."
+    return [message], [
         Suggestion("params.extrinsics.time_offset", offset, "by the turns of scans and gyroscope, s")
     ]
 

@@ -64,9 +64,9 @@ def summarised(parts: list[ImuData], T_imu_lidar: NDArray[np.float64] | None) ->
     clean, problems = [], []
     for part in parts:
         scale, _ = accel_scale(part.accel, DataConfig())
-        usable, said = cleaned(replace(part, accel=part.accel * scale), "IMU", T_imu_lidar)
+        usable, messages = cleaned(replace(part, accel=part.accel * scale), "IMU", T_imu_lidar)
         clean.append(usable)
-        problems += [sentence for sentence in said if sentence not in problems]
+        problems += [sentence for sentence in messages if sentence not in problems]
     clean = [part for part in clean if len(part.stamp_ns)]
     rate, jitter, gaps, longest = _rhythm(clean)
     up, rest = _up(clean)
@@ -99,20 +99,20 @@ def overlap(summary: InertialSummary, whole: bool, starts_ns: list[int], ends_ns
 
 
 def _problems(rate: float | None, magnitude: float | None, in_g: bool, tilt: float | None) -> list[str]:
-    said = []
+    messages = []
     if rate is not None and rate < _SLOW_HZ:
-        said.append(f"the IMU runs at {rate:.0f} Hz only: too slow to follow the motion within a sweep.")
+        messages.append(f"the IMU runs at {rate:.0f} Hz only: too slow to follow the motion within a sweep.")
     if in_g:
-        said.append(f"|accel| has the median {magnitude:.3f}: the accelerometer is in g.")
+        messages.append(f"|accel| has the median {magnitude:.3f}: the accelerometer is in g.")
     elif magnitude is not None and not _SI_RANGE[0] <= magnitude <= _SI_RANGE[1]:
-        said.append(f"|accel| has the median {magnitude:.2f} m/s^2, at rest it is 9.8: check its unit.")
+        messages.append(f"|accel| has the median {magnitude:.2f} m/s^2, at rest it is 9.8: check its unit.")
     # a force that points down is reported, with its remedy, by the checks of the samples
     if tilt is not None and _TILTED_DEG < tilt < 120.0:
-        said.append(
+        messages.append(
             f"gravity stands {tilt:.0f} deg from the lidar's z axis: the axes of IMU and lidar differ from "
             "what T_imu_lidar says, or the sensor is mounted tilted."
         )
-    return said
+    return messages
 
 
 def _rhythm(parts: list[ImuData]) -> tuple[float | None, float | None, int, float | None]:

@@ -77,8 +77,8 @@ def inspect_sequence(sequence: Sequence, settings: Settings | None = None) -> In
                 "there is an IMU but no calibration to the lidar: identity is used unless one is set."
             )
     if turns is not None and imu is not None:
-        said, fixes = suspicions(turns, scans.sweep, T_imu_lidar is not None, imu.rate)
-        problems += said
+        messages, fixes = suspicions(turns, scans.sweep, T_imu_lidar is not None, imu.rate)
+        problems += messages
         suggestions += fixes
     gps, truth = sequence.gps(), sequence.truth()
     suggestions += _suggestions(imu, T_imu_lidar is not None, scans, suggestions)
@@ -88,7 +88,7 @@ def inspect_sequence(sequence: Sequence, settings: Settings | None = None) -> In
         path=info.path,
         sensor=info.sensor,
         **_contents(sequence),
-        sampled=look.said,
+        sampled=look.summary,
         scans=info.scan_count,
         duration=(max(scans.ends_ns) - min(scans.starts_ns)) * 1e-9 if scans.starts_ns else None,
         scan_rate=scans.rate,

@@ -39,7 +39,7 @@ class Sampled:
     """Inertial samples of each part; a single part if all samples were read."""
     whole: bool
     """Whether all inertial samples were read."""
-    said: str
+    summary: str
     """Sentence on the parts that were left out; "" if none was."""
     _places: list[tuple[int, int]]
     """First and last time of receipt (ns) of each window in a bag; else first scan and number of scans."""
@@ -63,8 +63,8 @@ def sampled(sequence: Sequence) -> Sampled:
     if count <= _ALL_SCANS:
         return Sampled(sequence, parts, True, "", [(0, count)], [])
     places = [(round(at * (count - WINDOW_SCANS)), WINDOW_SCANS) for at in _shares(imu)]
-    said = f"{len(places)} windows of {WINDOW_SCANS} scans were looked at, of {count} scans."
-    return Sampled(sequence, parts, True, said, places, [])
+    summary = f"{len(places)} windows of {WINDOW_SCANS} scans were looked at, of {count} scans."
+    return Sampled(sequence, parts, True, summary, places, [])
 
 
 def _sampled_bag(bag: RosbagSequence, count: int) -> Sampled:
@@ -75,15 +75,15 @@ def _sampled_bag(bag: RosbagSequence, count: int) -> Sampled:
         if count <= _ALL_SCANS:
             return Sampled(bag, samples, True, "", [(0, count)], [])
         shares, length_s = _shares(imu), _window_s(contents.end_ns - contents.start_ns, count)
-        said = f"{len(shares)} windows of {WINDOW_SCANS} scans were looked at, of {count} scans."
-        return Sampled(bag, samples, True, said, [], _parts(bag, shares, length_s))
+        summary = f"{len(shares)} windows of {WINDOW_SCANS} scans were looked at, of {count} scans."
+        return Sampled(bag, samples, True, summary, [], _parts(bag, shares, length_s))
     parts = _parts(bag, np.linspace(0.0, 1.0, 2 * _WINDOWS).tolist(), _PART_S)
     read = [part.imu() for part in parts]
-    said = (
+    summary = (
         f"of {contents.size_bytes / 1e9:.1f} GB {len(parts)} parts of {_PART_S:g} s were looked at: gaps and "
         "jumps elsewhere are not seen."
     )
-    return Sampled(bag, [imu for imu in read if imu is not None], False, said, [], parts)
+    return Sampled(bag, [imu for imu in read if imu is not None], False, summary, [], parts)
 
 
 def _parts(bag: RosbagSequence, shares: list[float], length_s: float) -> list[RosbagSequence]:

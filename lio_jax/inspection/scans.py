@@ -127,33 +127,33 @@ class ScanSummary:
 
     def problems(self, count: int) -> list[str]:
         """Return one sentence for each fault; ``count`` is the recording's number of scans."""
-        said = []
+        messages = []
         if not self.counts:
-            said.append(f"none of the {count} scan(s) could be decoded.")
+            messages.append(f"none of the {count} scan(s) could be decoded.")
         elif min(self.counts) < FEW_POINTS:
             few = [name for name, points in zip(self.names, self.counts, strict=True) if points < FEW_POINTS]
-            said.append(
+            messages.append(
                 f"{len(few)} of {len(self.counts)} sampled scans hold fewer than {FEW_POINTS} points "
                 f"(first: {few[0]})."
             )
         if any(step <= 0 for step in self.steps_ns):
-            said.append("scan stamps do not ascend over the recording.")
+            messages.append("scan stamps do not ascend over the recording.")
         if self.gaps:
-            said.append(
+            messages.append(
                 f"{len(self.gaps)} step(s) between consecutive scans are too long, the longest "
                 f"{max(self.gaps):.3f} s: scans are missing there."
             )
         if len(self.rings) == 1:
-            said.append("all points carry the same ring: scan lines cannot be separated.")
+            messages.append("all points carry the same ring: scan lines cannot be separated.")
         if self.sweep and self.time_spreads and float(np.median(self.time_spreads)) == 0.0:
-            said.append(
+            messages.append(
                 f"all points of a scan carry one time although a sweep takes {self.sweep:.3f} s: its motion "
                 "cannot be compensated."
             )
         period = 1.0 / self.rate if self.rate else None
         if self.sweep and period and self.sweep > 1.5 * period:
-            said.append(
+            messages.append(
                 f"a scan lasts {self.sweep:.3g} s but one comes every {period:.3g} s: the unit of the point "
                 "times is wrong, set config.data.time_unit."
             )
-        return said
+        return messages

@@ -102,7 +102,7 @@ def added_to(
             (half_sides / block).astype(jnp.float32),
             point_map.nearer_by.astype(jnp.float32),
         )
-        # last, because whatever still reads the map beside it would make XLA copy the map
+        # last: XLA copies the map if another operation reads it afterwards
         maps.append(follow(pmap, frame, block))
         insertions.append(insertion)
     return FeatureMap(*maps), insertions[0], insertions[1]

@@ -86,9 +86,9 @@ def _chains_among(inside: _Flags, pairs: _Numbers) -> Chains:
     again = np.ones(len(own), bool)
     again[np.unique(own, return_index=True)[1]] = False
     before = (place[position[own]] == 1) & ~again
-    beside = position[own] + np.where(before, -1, 1)
-    nodes[beside] = other
-    link[np.minimum(beside, position[own])] = np.flatnonzero(outer)
+    adjacent = position[own] + np.where(before, -1, 1)
+    nodes[adjacent] = other
+    link[np.minimum(adjacent, position[own])] = np.flatnonzero(outer)
     return Chains(nodes, place, outside, link)
 
 
@@ -254,7 +254,7 @@ class _Columns:
 
     root: _Array
     """(k, d, d) L^-T of the factors L of the nodes' own blocks."""
-    beside: _Array
+    adjacent: _Array
     """(k, 2 d, d) rows of the nodes' two neighbours."""
 
 
@@ -320,14 +320,14 @@ def _eliminated(level: Level, blocks: _Array) -> _Columns:
         stop = 3 * size + k + 1
         panel[k:stop, k] *= 1 / np.sqrt(panel[k, k])
         panel[k + 1 : stop, k + 1 :] -= panel[k + 1 : stop, k, None] * panel[k + 1 : size, k]
-    beside = np.ascontiguousarray(panel[size : 3 * size].transpose(2, 0, 1))
+    adjacent = np.ascontiguousarray(panel[size : 3 * size].transpose(2, 0, 1))
     root = np.ascontiguousarray(panel[3 * size :].transpose(2, 0, 1))
     # a product with a copy of the transpose takes half the time of a product with its view
-    explained = beside @ np.ascontiguousarray(beside.transpose(0, 2, 1))
+    explained = adjacent @ np.ascontiguousarray(adjacent.transpose(0, 2, 1))
     blocks[level.couplings[:, 0]] = -explained[:, size:, :size]
     own = np.concatenate([explained[:, :size, :size], explained[:, size:, size:]])
     blocks[level.touched] -= (level.sums @ own.reshape(2 * count, -1)).reshape(-1, size, size)
-    return _Columns(root, beside)
+    return _Columns(root, adjacent)
 
 
 def solve(factor: Factor, right: _Array) -> _Array:
@@ -350,11 +350,11 @@ def solve(factor: Factor, right: _Array) -> _Array:
     for level, columns in steps:
         solved = columns.root.transpose(0, 2, 1) @ x[level.nodes]
         x[level.nodes] = solved
-        onto = (columns.beside @ solved).reshape(len(solved), 2, -1).swapaxes(0, 1)
+        onto = (columns.adjacent @ solved).reshape(len(solved), 2, -1).swapaxes(0, 1)
         x[level.touched] -= (level.sums @ onto.reshape(2 * len(solved), -1)).reshape(-1, *x.shape[1:])
     x[reduction.kept] = multifrontal.solve(factor.fronts, x[reduction.kept])
     for level, columns in reversed(steps):
         neighbours = x[level.neighbours].reshape(len(level.nodes), 2 * size, -1)
-        left = x[level.nodes] - columns.beside.transpose(0, 2, 1) @ neighbours
+        left = x[level.nodes] - columns.adjacent.transpose(0, 2, 1) @ neighbours
         x[level.nodes] = columns.root @ left
     return x[:count].reshape(right.shape)

@@ -343,8 +343,8 @@ def _parts(ids: NDArray[np.int64], ends: NDArray[np.int64]) -> list[str]:
         return []
     named = ", ".join(f"{ids[at]} ({size})" for at, size in zip(first[:5], sizes[:5], strict=True))
     more = ", ..." if len(first) > 5 else ""
-    said = f"the graph falls into {len(first)} parts that nothing joins; each is solved by itself"
-    return [f"{said}. Their first vertices (and sizes): {named}{more}."]
+    summary = f"the graph falls into {len(first)} parts that nothing joins; each is solved by itself"
+    return [f"{summary}. Their first vertices (and sizes): {named}{more}."]
 
 
 def _counted(count: int, noun: str) -> str:

@@ -250,7 +250,7 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
                 in_blocks[0],
                 params.point_map.nearer_by.astype(jnp.float32),
             )
-            # last, because whatever still reads the map beside it would make XLA copy the map
+            # last: XLA copies the map if another operation reads it afterwards
             cube_map = move_cube(cube_map, frame.anchor, *in_blocks)
 
         seen = jnp.any(thin.mask)

@@ -53,7 +53,8 @@ class Dual(NamedTuple):
 
     value: Any
     dot: Any
-    """Of the same structure, P along the first axis of each leaf; None for a leaf that is a constant."""
+    """Derivatives in the same structure, P along the first axis of each leaf; None for a leaf that is a
+    constant."""
 
     def with_velocity_of(self, found: "Dual") -> "Dual":
         """Return this first state with the velocity that a later state found, and its derivatives."""

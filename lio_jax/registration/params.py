@@ -83,7 +83,7 @@ class KnnParams(eqx.Module):
 
 
 class LineFitParams(KnnParams):
-    """Lines beside planes."""
+    """Lines and planes."""
 
     line_ratio: Scalar = leaf(3.0, above=0)
     """Neighbours make a line if their largest variance exceeds the second largest by this factor."""

@@ -21,7 +21,7 @@ from lio_jax.lidar.range_image import azimuth
 
 _SIDE, _NARROW = 8, 24
 """Number of rings above and below a query's own, and of points in each, that are searched first."""
-_BESIDE, _WIDE = 2, 32
+_PARTNER_RINGS, _WIDE = 2, 32
 """Number of rings around the nearest point's own, and of points in each, that are searched for the others."""
 _CHUNK, _FARTHER_NARROW, _FARTHER_WIDE = 32, 32, 256
 """Number of queries of a farther search at a time, and of points that it searches in each ring."""
@@ -153,11 +153,11 @@ def nearest_by_ring(
         lambda some: search.nearest(some, cloud_rings, _FARTHER_NARROW),
     )
     nearest, _ = _again(mask & ~sure, queries, nearest, search.nearest_of_all, _LAST_CHUNK)
-    beside, sure = search.beside((queries, nearest), _WIDE)
+    others, sure = search.partners((queries, nearest), _WIDE)
     given = queries, nearest
-    beside, sure = _again(mask & ~sure, given, beside, lambda some: search.beside(some, _FARTHER_WIDE))
-    beside, _ = _again(mask & ~sure, given, beside, search.beside_of_all, _LAST_CHUNK)
-    return Nearest(*(jnp.where(mask, place, -1) for place in (nearest, *beside)))
+    others, sure = _again(mask & ~sure, given, others, lambda some: search.partners(some, _FARTHER_WIDE))
+    others, _ = _again(mask & ~sure, given, others, search.partners_of_all, _LAST_CHUNK)
+    return Nearest(*(jnp.where(mask, place, -1) for place in (nearest, *others)))
 
 
 _Given = TypeVar("_Given")
@@ -217,13 +217,13 @@ class _Search(eqx.Module):
         beyond = jnp.sqrt(level**2 + queries.z**2) * jnp.sin(jnp.minimum(angle, _QUARTER))
         return place, (distance <= windows.reach()) & ((distance <= beyond) | jnp.isinf(angle))
 
-    def beside(
+    def partners(
         self, given: tuple[Queries, Int32[Array, " k"]], window: int
     ) -> tuple[tuple[Array, Array], Bool[Array, " k"]]:
         """Return the next point of the nearest one's ring and the nearest one of another, as ``nearest``."""
         queries, nearest = given
         ring = _take(self.index.ring, jnp.maximum(nearest, 0))
-        windows = _Windows.of(self, queries, jnp.maximum(ring, 0), _BESIDE, window)
+        windows = _Windows.of(self, queries, jnp.maximum(ring, 0), _PARTNER_RINGS, window)
         keys, step = computed_once(windows.keys()), jnp.abs(windows.ring_step())
         same, same_squared = windows.smallest(keys, (step == 0) & ~windows.is_at(nearest))
         other, other_squared = windows.smallest(keys, (step > 0) & (step < self.rings_apart))
@@ -239,10 +239,10 @@ class _Search(eqx.Module):
         within = (ring >= queries.lowest) & (ring < queries.lowest + self.cloud_rings)
         return _least(squared, within), jnp.ones_like(queries.lowest, bool)
 
-    def beside_of_all(
+    def partners_of_all(
         self, given: tuple[Queries, Int32[Array, " k"]]
     ) -> tuple[tuple[Array, Array], Bool[Array, " k"]]:
-        """Return the result of ``beside``, from a search of all points."""
+        """Return the result of ``partners``, from a search of all points."""
         queries, nearest = given
         ring = self.index.ring[:, None]
         squared = self._squared(queries)

@@ -131,22 +131,22 @@ def failure_of(now: Evidence, before: Evidence | None, settings: Settings) -> st
         settings: settings of the run.
     """
     limits = settings.values["limits"]
-    said = [_match_failure(now, settings)]
+    sentences = [_match_failure(now, settings)]
     if now.restarted:
-        said.append(
+        sentences.append(
             "the smoother's velocity or biases ran beyond params.limits or were not finite; "
             f"it started again at rest: {_cause(now)}."
         )
     if now.since_last_s > limits["outage"]:
         by = "constant velocity" if _gap(now) > LONGEST_GAP or now.imu_gap_s is None else "inertial samples"
-        said.append(f"no scan came for {now.since_last_s:.2f} s before it: {by} predicted the motion.")
+        sentences.append(f"no scan came for {now.since_last_s:.2f} s before it: {by} predicted the motion.")
     for what, value, earlier, limit in _limited(now, before, limits):
         if value > limits[limit] >= earlier:
-            said.append(
+            sentences.append(
                 f"{what[0]} {value:.3g} {what[1]}, above params.limits.{limit}={limits[limit]:g}: "
                 f"{_cause(now)}."
             )
-    first, *more = [sentence for sentence in said if sentence] or [""]
+    first, *more = [sentence for sentence in sentences if sentence] or [""]
     return " ".join([first, *(sentence[0].upper() + sentence[1:] for sentence in more)])
 
 

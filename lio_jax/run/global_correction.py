@@ -83,15 +83,17 @@ class BackEndThread:
             self.error = error
 
 
+_LINES_NAMED = 5
+"""Largest number of lines of a file that a warning names."""
 _KEPT_SPACING = 0.4
-"""Of the points that keyframes keep in memory for loops, m; on disk they have all."""
+"""Spacing of the points that keyframes keep in memory for loops, m. On disk they keep all points."""
 
 
 class GlobalCorrection(Sink):
-    """Corrects the trajectory and the map beside the odometry."""
+    """Corrects the trajectory and the map in a thread of its own, while the odometry goes on."""
 
     def __init__(self, sequence: Sequence, settings: Settings, out: Path, files: StateFiles) -> None:
-        """Begin beside a run.
+        """Begin a back end for a run.
 
         Args:
             sequence: whose GPS fixes are used.
@@ -105,28 +107,28 @@ class GlobalCorrection(Sink):
         self.notes: tuple[str, ...] = ()
         """What was found wrong with the fixes."""
         backend = settings.run.backend
-        closer = LoopCloser(settings) if backend.loops else None
+        self._closer = LoopCloser(settings) if backend.loops else None
         gate = self._gate(sequence, settings) if backend.gps else None
         self._settings, self._out, self._files = settings, out, files
         self._origin = sequence.gps().origin if gate else None  # type: ignore[union-attr]
         self._picker, self._store = KeyframePicker(settings), KeyframeWriter(out)
-        self._beside = BackEndThread(BackEnd(settings, closer, gate))
+        self._thread = BackEndThread(BackEnd(settings, self._closer, gate))
 
     def take(self, result: ScanResult) -> None:
         """Take the next scan's result; this never waits for the back end."""
         keyframe = self._picker(result)
         if keyframe is not None:
             self._store.append(keyframe.points, corner_marks(result))
-            self._beside.add(replace(keyframe, points=thinned(keyframe.points, _KEPT_SPACING)))
+            self._thread.add(replace(keyframe, points=thinned(keyframe.points, _KEPT_SPACING)))
 
     def finish(self, run: RunResult) -> None:
         """Write the corrected results and hand them over; what waits still counts unless the run was ended.
 
         The odometry's files are written already, so that an error here loses none of them.
         """
-        found = self._beside.finish(hurry=run.interruption is not None)
+        found = self._thread.finish(hurry=run.interruption is not None)
         run.odometry = odometry = run.trajectory
-        run.metrics["backend"] = self._said(found)
+        run.metrics["backend"] = self._summary(found)
         run.metrics["warnings"] += self._warnings()
         if not len(found.stamp_ns):
             return
@@ -147,7 +149,7 @@ class GlobalCorrection(Sink):
 
     def close(self) -> None:
         """Let the back end's thread end."""
-        self._beside.stop()
+        self._thread.stop()
 
     def _gate(self, sequence: Sequence, settings: Settings) -> GpsGate:
         recorded = sequence.gps()
@@ -178,12 +180,12 @@ class GlobalCorrection(Sink):
             tiles.write(self._out / "map.pcd")
         return read_cloud(self._out / "map.pcd")
 
-    def _said(self, found: Correction) -> dict[str, Any]:
+    def _summary(self, found: Correction) -> dict[str, Any]:
         weights = [weight for _, weight in found.loops if weight is not None]
         refused = Counter(verdict.reason for verdict, weight in found.loops if weight is None)
-        said: dict[str, Any] = {
+        summary: dict[str, Any] = {
             "keyframes": len(found.stamp_ns),
-            "busy_s": round(self._beside.busy_s, 3),
+            "busy_s": round(self._thread.busy_s, 3),
             "loops": {
                 "closed": len(weights),
                 "distrusted": sum(weight < 0.5 for weight in weights),
@@ -191,13 +193,25 @@ class GlobalCorrection(Sink):
             },
             "gps": found.fixes,
         }
-        return said | ({"error": str(self._beside.error)} if self._beside.error else {})
+        return summary | ({"error": str(self._thread.error)} if self._thread.error else {})
 
     def _warnings(self) -> tuple[str, ...]:
-        error = self._beside.error
+        error = self._thread.error
         kind = type(error).__name__
         ended = f"the back end ended early ({kind}: {error}); what it had done until then counts."
-        return (*self.notes, *((ended,) if error else ()))
+        return (*self.notes, *self._unused_pairs(), *((ended,) if error else ()))
+
+    def _unused_pairs(self) -> list[str]:
+        lines = [str(pair.line) for pair in self._closer.untried()] if self._closer else []
+        if not lines:
+            return []
+        named = ", ".join(lines[:_LINES_NAMED]) + (", ..." if len(lines) > _LINES_NAMED else "")
+        path = self._settings.run.loops.pairs
+        note = (
+            f"{path}: {len(lines)} pairs closed no loop, because their times belong to no two keyframes of "
+            f"this recording (lines {named}); times are in seconds, as in trajectory.tum."
+        )
+        return [note]
 
 
 def _graph(found: Correction) -> PoseGraph:

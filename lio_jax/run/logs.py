@@ -82,10 +82,6 @@ class TrajectoryLog(Sink):
         """Return T_world_imu at the scans' ends."""
         return Trajectory(self.column("stamps_ns"), self.column("poses"))
 
-    def lidar_poses(self) -> NDArray[np.float64]:
-        """Return T_world_lidar at the scans' ends, (n, 4, 4)."""
-        return self.column("poses") @ self.column("extrinsic")
-
     def write_npz(self, path: Path) -> None:
         """Write every column, with one row for each scan, at the scans' ends.
 

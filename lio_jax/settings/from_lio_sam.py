@@ -30,7 +30,7 @@ def _extrinsic_rot(value: Any, place: str, values: Mapping[str, Any]) -> tuple[d
 
 def _extrinsic_trans(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
     t_lidar_imu = vector(value, place)
-    R_lidar_imu = _rot_beside(place, values)
+    R_lidar_imu = _rotation_for(place, values)
     translation = [float(item) for item in -R_lidar_imu.inv().apply(t_lidar_imu) + 0.0]
     word = "-extrinsicRot^T extrinsicTrans: it is where the IMU lies in the lidar frame, ours is T_imu_lidar"
     return {"params.extrinsics.translation": translation}, word
@@ -38,7 +38,7 @@ def _extrinsic_trans(value: Any, place: str, values: Mapping[str, Any]) -> tuple
 
 def _extrinsic_rpy(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
     # some versions invert the matrix before they use it, others do not
-    of_orientations, of_samples = rotation(value, place), _rot_beside(place, values)
+    of_orientations, of_samples = rotation(value, place), _rotation_for(place, values)
     if any((of_orientations * other).magnitude() < _SAME_AXES for other in (of_samples, of_samples.inv())):
         return {}, (
             "fits extrinsicRot: the IMU's orientations are of its samples' axes, T_world_imu, as "
@@ -50,7 +50,7 @@ def _extrinsic_rpy(value: Any, place: str, values: Mapping[str, Any]) -> tuple[d
     )
 
 
-def _rot_beside(place: str, values: Mapping[str, Any]) -> Rotation:
+def _rotation_for(place: str, values: Mapping[str, Any]) -> Rotation:
     if "extrinsicRot" not in values:
         raise UsageError(f"{place} cannot be read without extrinsicRot, which is missing.")
     source = place.rpartition(": ")[0]

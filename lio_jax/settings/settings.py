@@ -145,7 +145,7 @@ def _numbers(recipe: type[AnyRecipe]) -> Values:
 
 @cache
 def _paths(recipe: type[AnyRecipe]) -> dict[str, Setting]:
-    """Return what a run with a recipe can be told, by path."""
+    """Return the settings of a run with a recipe, by path."""
     found: dict[str, Setting] = {}
     for kind, trees in (
         ("config", (RunConfig, recipe.config_type)),

@@ -1,4 +1,4 @@
-"""Settings that every run has beside those of its recipe: reading, the back end, output."""
+"""Settings that every run has in addition to those of its recipe: reading, the back end, output."""
 
 from dataclasses import dataclass
 

@@ -1,7 +1,7 @@
 """An inertial measurement unit at the body's origin: exact motion, then sensor errors that are all known."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -63,10 +63,6 @@ class ImuModel:
     """Angular rate at which a reading saturates, rad/s."""
     accel_range: float = 16 * 9.80665
     """Specific force at which a reading saturates, m/s^2."""
-
-    def noiseless(self) -> "ImuModel":
-        """Return the same unit without noise and biases."""
-        return replace(self, **dict.fromkeys((*_SPREADS, "gyro_bias", "accel_bias"), 0.0))
 
 
 @dataclass(frozen=True)

@@ -37,14 +37,14 @@ class Observed(eqx.Module):
     rmse: Float[Array, ""]
     """Robustly weighted root mean square distance of the scan to the map, m."""
     status: Int32[Array, ""]
-    """Of the solve, see :mod:`lio_jax.core.types`."""
+    """Status code of the solve, see :mod:`lio_jax.core.types`."""
     lost: Bool[Array, ""]
     covariance: Float[Array, "24 24"] | None
-    """Of the navigation state; None from recipes that carry none."""
+    """Covariance of the navigation state's error; None from recipes without one."""
     evidence: Evidence | None
     """How well the scan was foretold; None from recipes that carry no covariance."""
     log_evidence: Float[Array, ""] | None
-    """Of all measurements so far; None from recipes without a smoother."""
+    """Log-likelihood of all measurements so far; None from recipes without a smoother."""
     scan: Scan | None = None
     """As it was fed to the step."""
     params: Params | None = None
@@ -64,7 +64,7 @@ class Observed(eqx.Module):
             log_evidence=output.log_evidence,
         )
 
-    def beside(self, scan: Scan, params: Params) -> "Observed":
+    def with_scan(self, scan: Scan, params: Params) -> "Observed":
         """Return the same with what went into the step.
 
         Not by :meth:`of`: a program that hands its arguments through has them copied.
@@ -223,7 +223,7 @@ def range_noise(seen: Observed, truth: TruePose) -> Float[Array, ""]:
     scan, params = seen.scan, seen.params
     if scan is None or params is None:
         raise UsageError(
-            "the objective ranges wants the scan and the parameters beside what a step left to see."
+            "the objective ranges needs the scan and the parameters: call Observed.with_scan first."
         )
     scatter = range_scatter(scan, params.lidar)
     ranges = (params.lidar.range_sigma * scatter.spread) ** 2

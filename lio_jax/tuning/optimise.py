@@ -16,15 +16,15 @@ Vector = NDArray[np.float64]
 Evaluate = Callable[[Vector], Evaluated]
 
 _LARGEST_STEP = 1.0
-"""Of a component in one scoring step: a factor e of a positive parameter."""
+"""Largest change of a component in one scoring step: a factor e of a positive parameter."""
 _SMALLEST_SCALE, _LARGEST_SCALE = 0.1, 300.0
 _DAMPING = 0.02
-"""Of the information's diagonal."""
+"""Share of the information's diagonal that is added to it."""
 _LEAST_CURVATURE = 1.0
-"""What every component has at least: one that the recordings tell nothing of stays where it is."""
+"""Smallest curvature of a component: one that is not observable keeps its value."""
 _START_PRECISION = 1 / 9
-"""Of a component's start: a factor of 20 either way is one sigma. It brings back a noise that misleading
-gradients made so small, while others were far off, that the recordings tell nothing of it any more."""
+"""Precision of the prior at a component's start: its sigma is a factor of 20. While other parameters are far
+off, gradients can make a noise so small that it is no longer observable; the prior then brings it back."""
 
 
 class Bounds(NamedTuple):

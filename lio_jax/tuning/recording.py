@@ -52,11 +52,6 @@ class Recording:
     def __len__(self) -> int:
         return self._count
 
-    @property
-    def has_truth(self) -> bool:
-        """Return whether any pose is known."""
-        return self._truth is not None
-
     def scan_inputs(self) -> Iterator[ScanInput]:
         """Yield the scans."""
         return iter(self._kept) if self._kept is not None else self._read()

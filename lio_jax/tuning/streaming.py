@@ -108,7 +108,7 @@ def add_scan(
 ) -> Any:
     """Return an objective's sums with one more scan; the objective comes in two parts, static and arrays."""
     objective: Objective = eqx.combine(arrays, static)
-    return objective.add(sums, seen.beside(scan, params), truth)
+    return objective.add(sums, seen.with_scan(scan, params), truth)
 
 
 def value_of(static: Any, arrays: Any, sums: Any) -> Float[Array, ""]:

@@ -59,14 +59,14 @@ def run_report(run: RunRecord) -> str:
 
 
 def _global_correction(run: RunRecord) -> str:
-    said = run.metrics.get("backend")
-    if not said:
+    backend = run.metrics.get("backend")
+    if not backend:
         return ""
-    loops = said["loops"]
-    rows = [("keyframes", said["keyframes"]), ("loops closed", loops["closed"])]
+    loops = backend["loops"]
+    rows = [("keyframes", backend["keyframes"]), ("loops closed", loops["closed"])]
     rows += [("closed, but distrusted by the graph", loops["distrusted"])] if loops["distrusted"] else []
     rows += [(f"loops refused: {reason}", count) for reason, count in loops["refused"].items()]
-    rows += [(f"GPS fixes: {reason}", count) for reason, count in said["gps"].items()]
+    rows += [(f"GPS fixes: {reason}", count) for reason, count in backend["gps"].items()]
     return section(
         "Global correction",
         table(("", ""), [(name, str(count)) for name, count in rows]),
@@ -105,18 +105,18 @@ def headline(run: RunRecord) -> dict[str, str]:
 def _opening(run: RunRecord) -> str:
     recording: dict[str, Any] = run.metrics.get("recording", {})
     words = [recording.get("format", ""), recording.get("sensor", ""), recording.get("path", "")]
-    said = ", ".join(word for word in words if word)
-    return f"{said}. Motion predicted by {run.metrics.get('prediction', 'unknown')}." if said else ""
+    summary = ", ".join(word for word in words if word)
+    return f"{summary}. Motion predicted by {run.metrics.get('prediction', 'unknown')}." if summary else ""
 
 
 def _complaints(run: RunRecord) -> list[str]:
     metrics = run.metrics
     failures = [failure["message"] for failure in metrics.get("failures", [])]
     hidden = len(failures) - _FAILURES_SHOWN
-    said = [*metrics.get("warnings", []), *run.remarks, *failures[:_FAILURES_SHOWN]]
+    messages = [*metrics.get("warnings", []), *run.remarks, *failures[:_FAILURES_SHOWN]]
     if hidden > 0:
-        said.append(f"{hidden} more failed scans; metrics.json lists them all.")
-    return [bullets(said, bad=True) or paragraph("None.")]
+        messages.append(f"{hidden} more failed scans; metrics.json lists them all.")
+    return [bullets(messages, bad=True) or paragraph("None.")]
 
 
 def _metres(value: float | None) -> str:
@@ -269,9 +269,9 @@ def _times(names: list[str], runs: Sequence[RunRecord]) -> str:
 
 
 def _complaints_of(names: list[str], runs: Sequence[RunRecord]) -> list[str]:
-    said = []
+    messages = []
     for name, run in zip(names, runs, strict=True):
         failures = len(run.metrics.get("failures", []))
-        said += [f"{name}: {failures} failed scans"] * (failures > 0)
-        said += [f"{name}: {sentence}" for sentence in (*run.metrics.get("warnings", []), *run.remarks)]
-    return [bullets(said, bad=True) or paragraph("None.")]
+        messages += [f"{name}: {failures} failed scans"] * (failures > 0)
+        messages += [f"{name}: {sentence}" for sentence in (*run.metrics.get("warnings", []), *run.remarks)]
+    return [bullets(messages, bad=True) or paragraph("None.")]

@@ -112,8 +112,8 @@ def _unobserved(tracked: ScanResult, T_world_lidar: NDArray[np.float64]) -> NDAr
     """Return the (k, 3) unobservable directions in the lidar frame, of the position or of a rotation axis."""
     found = tracked.output.registration
     # the first scan has no map to be matched with
-    told = tracked.index > 0 and np.isfinite(np.asarray(found.information)).all()
-    weak = weak_directions(found) if told else np.zeros((6, 0))
+    known = tracked.index > 0 and np.isfinite(np.asarray(found.information)).all()
+    weak = weak_directions(found) if known else np.zeros((6, 0))
     turns, moves = weak[:3], weak[3:]
     stronger = np.where(np.linalg.norm(moves, axis=0) >= np.linalg.norm(turns, axis=0), moves, turns)
     return (T_world_lidar[:3, :3].T @ stronger).T

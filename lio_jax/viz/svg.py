@@ -124,10 +124,10 @@ def frame(axes: Axes, x_label: str, y_label: str, x_ticks: Mapping[float, str] |
         for place, text in zip(y, names, strict=True)
     ]
     across, upright = (axes.left + axes.right) / 2, (axes.top + axes.bottom) / 2
-    below, beside = f'x="{across}" y="{axes.height - 5}"', f'transform="translate(11 {upright}) rotate(-90)"'
+    below, at_left = f'x="{across}" y="{axes.height - 5}"', f'transform="translate(11 {upright}) rotate(-90)"'
     texts += [
         f'<text {place} text-anchor="middle">{escape(label)}</text>'
-        for place, label in ((below, x_label), (beside, y_label))
+        for place, label in ((below, x_label), (at_left, y_label))
     ]
     return f'<path class="grid" d="{grid}"/>' + "".join(texts)
 

@@ -23,7 +23,7 @@ from lio_jax.core.error_state import (
 from lio_jax.core.types import CONVERGED, NavState
 from lio_jax.estimation.iterated_filter import Measurement, Update
 from lio_jax.estimation.nav_update import reset_jacobian, update_nav
-from lio_jax.estimation.pose_measurement import measured_pose
+from tests.estimation.measured_pose import measured_pose
 from tests.estimation.navs import random_covariance, random_nav
 
 TOLERANCES = {"rotation_tolerance": jnp.array(1e-11), "translation_tolerance": jnp.array(1e-11)}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.error_state import DOF, TIME_OFFSET, retract
-from lio_jax.estimation.pose_measurement import keep_observed, lidar_pose_jacobian, measured_pose
+from lio_jax.estimation.pose_measurement import keep_observed, lidar_pose_jacobian
 from tests.estimation.navs import random_nav
 
 keep = jax.jit(keep_observed)
@@ -36,31 +36,6 @@ def test_the_jacobian_is_that_of_the_lidar_pose(seed) -> None:
     jacobian = jax.jit(lidar_pose_jacobian)(nav)
     np.testing.assert_allclose(jacobian, pose_jacobian_by_differentiation(nav), atol=1e-12)
     assert not np.any(np.asarray(jacobian)[:, TIME_OFFSET])
-
-
-@pytest.mark.parametrize("distance", [0.0, 0.01, 1.0])
-def test_a_measured_pose_has_the_derivatives_of_its_cost(distance) -> None:
-    nav = random_nav(7)
-    root = np.random.default_rng(8).normal(size=(6, 6))
-    information = jnp.asarray(root @ root.T)
-    H, error, measured = jax.jit(pose_error_and_derivative)(nav, jnp.array(distance))
-    result = jax.jit(measured_pose)(nav, measured, information)
-    np.testing.assert_allclose(result.information, H.T @ information @ H, atol=1e-9)
-    np.testing.assert_allclose(result.gradient, H.T @ information @ error, atol=1e-9)
-
-
-def pose_error_and_derivative(nav, distance):
-    predicted = nav.T_world_imu @ nav.T_imu_lidar
-    measured = predicted @ jaxlie.SE3.exp(distance * jnp.array([0.3, -1.0, 0.5, 0.7, -0.2, 0.6]))
-
-    def pose_error(d):
-        T = jaxlie.SE3.from_rotation_and_translation(
-            jaxlie.SO3.exp(d[:3]) @ predicted.rotation(), predicted.translation() + d[3:]
-        )
-        missed = measured.inverse() @ T
-        return jnp.concatenate([missed.rotation().log(), missed.translation()])
-
-    return jax.jacfwd(pose_error)(jnp.zeros(6)), pose_error(jnp.zeros(6)), measured
 
 
 def tunnel(seed):

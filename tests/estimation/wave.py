@@ -12,9 +12,9 @@ from lio_jax.core.error_state import DOF, NavEstimate, SweptState, local, retrac
 from lio_jax.core.types import ImuBatch, NavState
 from lio_jax.estimation.iterated_filter import Update
 from lio_jax.estimation.nav_update import update_nav
-from lio_jax.estimation.pose_measurement import measured_pose
 from lio_jax.imu.params import ImuParams
 from lio_jax.imu.strapdown import propagate
+from tests.estimation.measured_pose import measured_pose
 
 STEP = 1 / 200
 """Between inertial samples, s."""

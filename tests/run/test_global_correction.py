@@ -94,6 +94,16 @@ def test_a_back_end_that_fails_costs_the_correction_alone(tmp_path, settings, mo
     assert len(read_keyframes(tmp_path).stamps_ns) > 1
 
 
+def test_pairs_of_times_without_keyframes_are_named(tmp_path, settings):
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("1 42\n33 38\n")
+    named = with_overrides(settings, [*BOTH[:1], f"config.loops.pairs={pairs}"])
+    result = run_sequence(Replay(moving()[:4]), named, tmp_path / "run")
+    (warning,) = [warning for warning in result.metrics["warnings"] if str(pairs) in warning]
+    assert "2 pairs closed no loop" in warning
+    assert "(lines 1, 2)" in warning
+
+
 def test_ctrl_c_keeps_what_is_corrected(tmp_path, settings):
     class Interrupt(Sink):
         def take(self, result):

@@ -21,7 +21,14 @@ from lio_jax.sim.imu import GRAVITY, ImuModel, simulate_imu, specific_force
 from lio_jax.sim.trajectory import kinematics_at, motion_along
 from tests.sim.routes import LAP, WALK
 
-IDEAL = ImuModel().noiseless()
+IDEAL = ImuModel(
+    gyro_noise=0.0,
+    accel_noise=0.0,
+    gyro_bias_walk=0.0,
+    accel_bias_walk=0.0,
+    gyro_bias_sigma=0.0,
+    accel_bias_sigma=0.0,
+)
 
 
 @pytest.fixture(scope="module")
