@@ -3,7 +3,6 @@
 import gc
 import os
 import shutil
-import tempfile
 from pathlib import Path
 
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=true")
@@ -17,10 +16,12 @@ from tests import type_checker
 
 jax.config.update("jax_enable_x64", True)
 
-_OWN_CACHE = None if os.environ.get("LIO_JAX_TEST_CACHE") else tempfile.mkdtemp(prefix="lio-jax-programs-")
-"""Made by this process and shared by the worker processes, which inherit its name."""
-if _OWN_CACHE:
-    os.environ["LIO_JAX_TEST_CACHE"] = _OWN_CACHE
+_ROOT = Path(__file__).parents[1]
+_KEPT = Path(os.environ.setdefault("LIO_JAX_TEST_CACHE", str(_ROOT / ".pytest_cache" / "programs")))
+"""Compiled programs, shared by the worker processes and kept for the next run: a program that has not changed
+is not compiled again."""
+_MOST_KEPT = 2 * 2**30
+"""Bytes. One run leaves about 0.2 GiB."""
 os.environ["LIO_JAX_CACHE"] = os.environ["LIO_JAX_TEST_CACHE"]
 _KEEP_PROGRAMS = {
     "jax_compilation_cache_dir": os.environ["LIO_JAX_TEST_CACHE"],
@@ -44,10 +45,12 @@ _CHECKED = (
 install_import_hook([f"lio_jax.{name}" for name in _CHECKED.split()], f"{type_checker.__name__}.checked")
 
 
-def pytest_unconfigure() -> None:
-    """Remove the cache that this process made."""
-    if _OWN_CACHE:
-        shutil.rmtree(_OWN_CACHE, ignore_errors=True)
+def pytest_configure(config: pytest.Config) -> None:
+    """Drop the kept programs once they take too much room."""
+    if not hasattr(config, "workerinput") and _KEPT.is_dir():
+        taken = sum(entry.stat().st_size for entry in os.scandir(_KEPT))
+        if taken > _MOST_KEPT:
+            shutil.rmtree(_KEPT, ignore_errors=True)
 
 
 _MAPPINGS, _MEMORY = Path("/proc/self/maps"), Path("/proc/self/statm")

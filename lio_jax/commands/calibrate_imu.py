@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import yaml
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from lio_jax.commands.runtime import say
 from lio_jax.core.errors import LioJaxError, UsageError
-from lio_jax.core.files import atomic_path
+from lio_jax.core.files import atomic_path, read_arrays
 from lio_jax.data.config import DataConfig
 from lio_jax.data.detect import open_sequence
 from lio_jax.data.imu_checks import GAP_FACTOR, STANDARD_GRAVITY, cleaned, first_motion
@@ -100,9 +99,8 @@ def imu_of(data: Path) -> ImuData:
 def _from_npz(path: Path) -> ImuData:
     """Read stamp_ns, gyro and accel; or rate_hz in place of stamps, gyro_dps in deg/s, accel_g in g."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {key: np.asarray(file[key]) for key in file.files}
-    except (OSError, ValueError, EOFError, BadZipFile):
+        arrays = read_arrays(path)
+    except (OSError, ValueError):
         raise LioJaxError(f"{path}: cannot be read as an .npz file; give a native imu.npz.") from None
     if "gyro_dps" in arrays:
         arrays["gyro"] = np.radians(arrays["gyro_dps"].astype(np.float64))

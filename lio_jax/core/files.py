@@ -5,11 +5,39 @@ import os
 import re
 import secrets
 import shutil
+import struct
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 _TOKEN_BYTES = 4
+_DAMAGES = (KeyError, EOFError, MemoryError, RuntimeError, struct.error, zipfile.BadZipFile, zlib.error)
+"""What a damaged .npz file may raise in addition to ValueError."""
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return all arrays of an .npz file by name; objects are never unpickled.
+
+    Raises:
+        OSError: the file can't be opened or read.
+        ValueError: the file is damaged, or it is not an .npz file.
+    """
+    # opened here, because numpy leaves a damaged file open
+    with path.open("rb") as opened:
+        try:
+            file = np.load(opened, allow_pickle=False)
+            if isinstance(file, np.ndarray):
+                raise ValueError("it holds one array and is no .npz archive")
+            with file:
+                return {name: file[name] for name in file.files}
+        except _DAMAGES as error:
+            raise ValueError(str(error) or type(error).__name__) from None
 
 
 @contextmanager

@@ -1,6 +1,5 @@
 """The package's own recording format: a folder with meta.yaml, scans/, imu.npz, gps.npz and truth.tum."""
 
-import zipfile
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -11,6 +10,7 @@ import yaml
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
+from lio_jax.core.files import read_arrays
 from lio_jax.data.config import DataConfig
 from lio_jax.data.pointcloud2 import valid_returns
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
@@ -20,8 +20,6 @@ from lio_jax.data.velodyne_file import listed, missing_numbers, numbered_files
 
 FORMAT_VERSION = 1
 """Format version that is written to meta.yaml, and the only one that is read."""
-
-_UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 
 
 class NativeSequence:
@@ -105,10 +103,8 @@ class NativeSequence:
 
     def _load_scan(self, path: Path) -> LidarScan | None:
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {key: file[key] for key in file.files}
-            return _scan_of(arrays, self._compensated)
-        except _UNREADABLE as error:
+            return _scan_of(read_arrays(path), self._compensated)
+        except (OSError, ValueError, KeyError) as error:
             self._log.add(f"{path}: cannot be read ({error}), the scan was skipped.")
             return None
 
@@ -117,9 +113,8 @@ class NativeSequence:
         if not path.is_file():
             return None
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {key: file[key] for key in file.files}
-        except _UNREADABLE as error:
+            arrays = read_arrays(path)
+        except (OSError, ValueError) as error:
             raise LioJaxError(f"{path}: cannot be read ({error}); write the folder again.") from None
         if missing := [key for key in required if key not in arrays]:
             raise LioJaxError(f"{path}: lacks {', '.join(missing)}; write the folder again.")

@@ -202,7 +202,8 @@ class GlobalCorrection(Sink):
         return (*self.notes, *self._unused_pairs(), *((ended,) if error else ()))
 
     def _unused_pairs(self) -> list[str]:
-        lines = [str(pair.line) for pair in self._closer.untried()] if self._closer else []
+        pairs = self._closer.untried() if self._closer else []
+        lines = [str(line) for line in sorted(pair.line for pair in pairs)]
         if not lines:
             return []
         named = ", ".join(lines[:_LINES_NAMED]) + (", ..." if len(lines) > _LINES_NAMED else "")

@@ -1,7 +1,6 @@
 """Pick keyframes from a trajectory, chain them into a pose graph, and keep their clouds on disk."""
 
 import re
-import zipfile
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.core.files import atomic_path
+from lio_jax.core.files import atomic_path, read_arrays
 from lio_jax.core.geometry import carried
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.pose_graph.g2o import Edge
@@ -123,7 +122,6 @@ Part = Literal["whole", "corner", "surface"]
 
 _INDEX = "index.npz"
 _OURS = re.compile(r"(\d{6,}|index|\.(\d{6,}|index)\.[0-9a-f]{8})\.npz")
-_UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
 
 
 class KeyframeWriter:
@@ -253,9 +251,8 @@ def _name(number: int) -> str:
 
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
+        return read_arrays(path)
     except FileNotFoundError:
         raise LioJaxError(f"{path}: missing; run again.") from None
-    except _UNREADABLE as error:
+    except (OSError, ValueError) as error:
         raise LioJaxError(f"{path}: cannot be read ({error}); run again.") from None

@@ -63,7 +63,7 @@ def run_sequence(
     Args:
         sequence: the recording.
         settings: recipe, config and params, the extrinsics resolved.
-        out: an existing folder.
+        out: the run folder; it is made if it does not exist.
         start: first scan.
         count: number of scans; None: to the end.
         sinks: your own, derived from :class:`lio_jax.Sink`: each takes every scan's result after the run's
@@ -79,6 +79,7 @@ def run_sequence(
         for sink in sinks:
             stack.callback(sink.close)
         check_start(sequence, start)
+        out.mkdir(parents=True, exist_ok=True)
         began = time.perf_counter()
         step = step or CompiledStep(settings)
         imu, imu_notes = imu_feed(sequence, settings)

@@ -10,6 +10,7 @@ import yaml
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
+from lio_jax.core.files import read_arrays
 from lio_jax.data.trajectory import Trajectory, read_tum
 from lio_jax.evaluation.association import MatchedTrajectories, match_by_time
 from lio_jax.evaluation.trajectory_error import Alignment, align
@@ -153,28 +154,18 @@ def read_run(folder: Path) -> RunRecord:
         text = reading.read_text()
         config = yaml.safe_load(text)
         reading = folder / "states.npz"
-        states = _columns(reading)
+        states = read_arrays(reading)
         if "poses" not in states or not len(states["poses"]):
             raise ValueError("it holds no poses")
         reading = folder / "scans.npz"
-        scans = _columns(reading) if reading.is_file() else {}
-    except (OSError, ValueError, yaml.YAMLError, EOFError) as error:
+        scans = read_arrays(reading) if reading.is_file() else {}
+    except (OSError, ValueError, yaml.YAMLError) as error:
         raise LioJaxError(f"{reading}: cannot be read ({error}); run again.") from None
     remarks: list[str] = []
     run = RunRecord(
         folder, metrics, text, config, states, scans, remarks=remarks, correction=read_correction(folder)
     )
     return replace(run, comparison=_compared(folder / "truth.tum", run.trajectory, remarks))
-
-
-def _columns(path: Path) -> dict[str, NDArray]:
-    import zipfile
-
-    try:
-        with np.load(path) as file:
-            return {name: file[name] for name in file.files}
-    except zipfile.BadZipFile as error:
-        raise ValueError(str(error)) from None
 
 
 def _compared(path: Path, estimate: Trajectory, remarks: list[str]) -> Comparison | None:

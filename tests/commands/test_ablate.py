@@ -57,6 +57,7 @@ def check_page(out):
     return page
 
 
+@pytest.mark.long
 def test_smoke(cli, tmp_path):
     out = tmp_path / "out"
     done = cli("ablate", SMOKE, "--report", "--out", out)
@@ -107,6 +108,7 @@ def test_a_sequence_that_is_not_there_stops_no_other(cli, tmp_path):
     assert record.stat().st_mtime_ns > first
 
 
+@pytest.mark.long
 def test_everything_may_be_kept(cli, tmp_path):
     changes = {"keep": "everything", "grid": {"params.map.voxel_size": [0.8]}}
     out = tmp_path / "out"
@@ -148,6 +150,7 @@ def test_a_scheduler_that_is_not_there(cli, tmp_path, monkeypatch):
         assert "Traceback" not in done.err
 
 
+@pytest.mark.long
 def test_a_running_scheduler(cli, tmp_path):
     from distributed import LocalCluster
 
@@ -178,6 +181,7 @@ def test_a_folder_of_something_else(cli, tmp_path):
     assert "holds something else than an ablation" in done.err
 
 
+@pytest.mark.long
 def test_a_full_disk(tmp_path):
     """Workers take the limit over from the command, and cut off the programs that they keep."""
     programs = shutil.copytree(os.environ["LIO_JAX_CACHE"], tmp_path / "programs")

@@ -1,11 +1,13 @@
 """A file appears whole or not at all."""
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from lio_jax.core.files import aside_of, atomic_path, folder_lock, remove_leftovers
+from lio_jax.core.files import aside_of, atomic_path, folder_lock, read_arrays, remove_leftovers
 
 
 def test_file_appears_when_the_block_ends(tmp_path):
@@ -101,3 +103,45 @@ def test_a_folder_whose_writer_lives_is_no_leftover(tmp_path):
     with folder_lock(living):
         remove_leftovers(tmp_path / "drive")
     assert list(tmp_path.iterdir()) == [living]
+
+
+def saved(path: Path) -> bytes:
+    np.savez_compressed(path, points=np.arange(3000.0), note=np.array("a"))
+    return path.read_bytes()
+
+
+def test_arrays_come_back(tmp_path):
+    saved(tmp_path / "a.npz")
+    read = read_arrays(tmp_path / "a.npz")
+    np.testing.assert_array_equal(read["points"], np.arange(3000.0))
+
+
+@pytest.mark.parametrize("cut", [0, 1, 30, 200, 1000, -1])
+def test_a_cut_file_of_arrays_is_damaged(tmp_path, cut):
+    path = tmp_path / "a.npz"
+    path.write_bytes(saved(path)[:cut])
+    with pytest.raises(ValueError, match=r"."):
+        read_arrays(path)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_overwritten_bytes_are_a_damage_or_harmless(tmp_path, seed):
+    path, rng = tmp_path / "a.npz", np.random.default_rng(seed)
+    data = bytearray(saved(path))
+    for at in rng.integers(0, len(data), 8):
+        data[at] = rng.integers(256)
+    path.write_bytes(data)
+    with suppress(ValueError):
+        read_arrays(path)
+
+
+def test_one_array_is_no_archive(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros(3))
+    with pytest.raises(ValueError, match=r"no \.npz archive"):
+        read_arrays(tmp_path / "a.npy")
+
+
+def test_objects_are_not_unpickled(tmp_path):
+    np.savez(tmp_path / "a.npz", evil=np.array([{}], object))
+    with pytest.raises(ValueError, match="allow_pickle"):
+        read_arrays(tmp_path / "a.npz")

@@ -62,6 +62,7 @@ def test_the_script_of_a_slurm_job(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_the_kitti_table(tmp_path):
     for name in ("00", "03"):
         write_kitti(tmp_path / "kitti" / "sequences" / name, moving())

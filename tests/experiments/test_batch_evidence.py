@@ -26,6 +26,9 @@ from batch_evidence import STILL, Noise, Sweep, lag_terms, linearised, log_evide
 from simulated_chain import IMU, POSE_SIGMA, preintegrated_anew, rows, simulate  # isort: skip
 
 
+pytestmark = pytest.mark.long
+
+
 @pytest.fixture(scope="module")
 def solved():
     """A chain whose first state's pose is not measured, at its solution."""

@@ -94,6 +94,7 @@ def test_its_gradient_is_the_slope():
     assert np.isfinite(found.gradient["imu.gyro_noise"])
 
 
+@pytest.mark.long
 def test_it_batches():
     sequence = SimulatedSequence("street", "vlp16", 0.2, seed=1, imu=ImuModel())
     settings, _ = settings_for(sequence, recipe_settings(NAME))

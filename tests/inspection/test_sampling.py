@@ -37,7 +37,7 @@ def test_a_long_bag_is_looked_at_in_windows(tmp_path):
     look = sampled(bag)
     windows = list(look.windows())
     assert look.whole
-    assert "4 windows of 12 scans were looked at, of 60 scans" in look.said
+    assert "4 windows of 12 scans were looked at, of 60 scans" in look.summary
     assert all(len(window.scans) == WINDOW_SCANS for window in windows)
     stamps = [scan.stamp_ns for window in windows for scan in window.scans]
     everything = [scan.stamp_ns for scan in bag.scans()]

@@ -114,7 +114,7 @@ def test_the_range_noise_is_found_among_poles(sigma, start):
         def loss(logarithm):
             lidar = dataclasses.replace(PARAMS.lidar, range_sigma=jnp.exp(logarithm))
             seen = Observed(nav, jnp.array(0.1), jnp.int32(0), jnp.array(False), None, None, None)
-            return range_noise(seen.beside(scan, dataclasses.replace(PARAMS, lidar=lidar)), truth)
+            return range_noise(seen.with_scan(scan, dataclasses.replace(PARAMS, lidar=lidar)), truth)
 
         return jax.grad(loss)(logarithm), jax.hessian(loss)(logarithm)
 

@@ -15,7 +15,7 @@ from tests.loops.graphs import graph_of, walk, with_edges, with_poses
 STEP = 1e-5
 
 
-@pytest.fixture(params=[jaxlie.SE3, jaxlie.SE2], ids=["space", "plane"])
+@pytest.fixture(params=[pytest.param(jaxlie.SE3, marks=pytest.mark.long), jaxlie.SE2], ids=["space", "plane"])
 def graph(request):
     """Return a graph whose residuals are large, so that the exact Hessian is not Gauss-Newton's."""
     rng = np.random.default_rng(2)

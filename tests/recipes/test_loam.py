@@ -186,7 +186,9 @@ def test_without_any_corner_planes_alone_are_matched():
     assert ate(poses) < 0.1
 
 
-@pytest.mark.parametrize(("sensor", "rings"), [("vlp8", 8), ("os1_128", 128)])
+@pytest.mark.parametrize(
+    ("sensor", "rings"), [("vlp8", 8), pytest.param("os1_128", 128, marks=pytest.mark.long)]
+)
 def test_eight_and_128_beams(sensor, rings):
     if sensor == "vlp8":
         whole = SimulatedSequence("street", duration_s=1.0, beams=8, columns=512, seed=1, standstill_s=0.0)

@@ -145,8 +145,8 @@ def test_innovations_want_a_filter(name):
         loss(MeanOverScans(objective_named(name).objective.loss), poses(0), poses(1))
 
 
-def test_the_range_noise_wants_the_scan():
-    with pytest.raises(UsageError, match="wants the scan"):
+def test_the_range_noise_needs_the_scan():
+    with pytest.raises(UsageError, match="needs the scan"):
         loss(objective_named("ranges").objective, poses(0), poses(1))
 
 

@@ -150,6 +150,7 @@ def check_gradients(recipe: str, inertial: bool) -> None:
         assert result.gradient[component] == pytest.approx(difference, rel=1e-4, abs=noise / step), name
 
 
+@pytest.mark.long
 def test_the_marginal_likelihood_has_a_derivative_by_every_leaf():
     """Finite, and none where the smoother and its scan matches have no part in it."""
     chosen = settings("lio_sam", True, *TIGHT)
@@ -171,6 +172,7 @@ def test_the_marginal_likelihood_has_a_derivative_by_every_leaf():
 FEW = ("imu.gyro_noise", "imu.accel_noise", "lidar.range_sigma", "extrinsics.*")
 
 
+@pytest.mark.long
 def test_reverse_mode_and_a_batch_of_parameters_give_the_same_numbers():
     chosen = settings("default", True, *TIGHT)
     recording = DoubleRecording(drive(), chosen)
@@ -190,6 +192,7 @@ def test_reverse_mode_and_a_batch_of_parameters_give_the_same_numbers():
     np.testing.assert_allclose(values, [streamed.value, alone], rtol=1e-4)
 
 
+@pytest.mark.long
 def test_a_solve_that_does_not_converge_is_flagged():
     chosen = settings("default", True, *TIGHT, "config.registration.max_iterations=2")
     recording = DoubleRecording(drive(), chosen, 0, 6)

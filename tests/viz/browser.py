@@ -125,12 +125,17 @@ async def _watched(port_file: Path, enough: Callable[[np.ndarray], bool], until:
     page = next(target for target in targets if target["type"] == "page")
     socket = await websocket_connect(page["webSocketDebuggerUrl"], max_message_size=2**28)
     number = 0
-    while True:
-        await asyncio.sleep(_LOOK_EVERY_S)
-        number += 1
-        await socket.write_message(json.dumps({"id": number, "method": "Page.captureScreenshot"}))
-        while (answer := json.loads(await socket.read_message())).get("id") != number:
-            pass
-        picture = matplotlib.image.imread(io.BytesIO(base64.b64decode(answer["result"]["data"])))[..., :3]
-        if enough(picture) or time.monotonic() > until:
-            return picture
+    try:
+        while True:
+            await asyncio.sleep(_LOOK_EVERY_S)
+            number += 1
+            await socket.write_message(json.dumps({"id": number, "method": "Page.captureScreenshot"}))
+            while (answer := json.loads(await socket.read_message())).get("id") != number:
+                pass
+            picture = matplotlib.image.imread(io.BytesIO(base64.b64decode(answer["result"]["data"])))[..., :3]
+            if enough(picture) or time.monotonic() > until:
+                return picture
+    finally:
+        socket.close()
+        # the answer of the browser ends the connection
+        await socket.read_message()

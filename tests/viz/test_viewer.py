@@ -121,20 +121,14 @@ def test_a_folder_without_a_recording_is_refused(tmp_path, capsys):
 def test_the_command_serves_until_it_is_interrupted(tmp_path):
     short(tmp_path / "recording.rrd")
     command = [sys.executable, "-m", "lio_jax.cli", "view", str(tmp_path), "--web"]
-    process = subprocess.Popen(
-        command,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ,
-        # a shell that runs this in the background has Ctrl-C ignored
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    said = process.stderr.readline()
-    page = said.removeprefix("open ").strip()
-    assert page.startswith("http://127.0.0.1:")
-    assert answer(page)
-    process.send_signal(signal.SIGINT)
-    assert process.wait(30) == 0
+    # a shell that runs this in the background has Ctrl-C ignored
+    heed = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ, **heed) as process:
+        page = process.stderr.readline().removeprefix("open ").strip()
+        assert page.startswith("http://127.0.0.1:")
+        assert answer(page)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
     time.sleep(0.1)
     with socket.socket() as probe:
         assert probe.connect_ex(("127.0.0.1", port_of(page))) != 0
