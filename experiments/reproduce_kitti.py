@@ -17,7 +17,7 @@ from typing import Any
 
 import yaml
 
-from lio_jax.ablation.ranking import Comparison, compare
+from lio_jax.ablation.ranking import VariantComparison, compare
 from lio_jax.ablation.spec import Spec, load_spec
 from lio_jax.ablation.store import Store
 from lio_jax.ablation.tasks import tasks_of
@@ -89,7 +89,7 @@ def _resolved(recipe: str) -> str:
     return str(Path(recipe).resolve()) if recipe.endswith((".yaml", ".yml")) else recipe
 
 
-def _rows(comparison: Comparison, variant: str, there: list[str]) -> dict[str, dict[str, Any]]:
+def _rows(comparison: VariantComparison, variant: str, there: list[str]) -> dict[str, dict[str, Any]]:
     """Return translation %, rotation deg/100 m and ms of each sequence; None without a value."""
     found = {}
     for name in there:

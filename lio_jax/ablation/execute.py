@@ -9,7 +9,7 @@ from typing import Any
 
 from lio_jax.ablation.cluster import Workers
 from lio_jax.ablation.perform import perform
-from lio_jax.ablation.ranking import Comparison, compare
+from lio_jax.ablation.ranking import VariantComparison, compare
 from lio_jax.ablation.spec import load_spec
 from lio_jax.ablation.store import Store, opened
 from lio_jax.ablation.tasks import Task, pieces, tasks_of
@@ -115,7 +115,7 @@ def _ended(store: Store, keys: Sequence[str]) -> set[str]:
     return {*store.done(keys), *store.failed(keys)}
 
 
-def run_ablation(spec_path: Path, out: Path) -> Comparison:
+def run_ablation(spec_path: Path, out: Path) -> VariantComparison:
     """Run the ablation of a specification, one run after the other, and compare the results.
 
     It works like ``lio-jax ablate``, with JAX as the caller has set it up. Runs whose results are in ``out``

@@ -140,7 +140,7 @@ Values = dict[str, dict[str, dict[Case, float]]]
 
 
 @dataclass(frozen=True)
-class Comparison:
+class VariantComparison:
     """All that a table and a report show."""
 
     spec: Spec
@@ -163,7 +163,7 @@ class Comparison:
         return as_text(self)
 
 
-def compare(spec: Spec, tasks: list[Task], store: Store) -> Comparison:
+def compare(spec: Spec, tasks: list[Task], store: Store) -> VariantComparison:
     """Read the results of all runs and rank them."""
     columns = list(dict.fromkeys((*spec.metrics, TIME)))
     table = gathered(store, tasks, columns)
@@ -177,7 +177,7 @@ def compare(spec: Spec, tasks: list[Task], store: Store) -> Comparison:
     rows = ranking(values, [variant.name for variant in spec.variants], spec.baseline.name, len(spec.sources))
     keys = [task.key for task in tasks]
     failures = {key: store.reason(key) for key in store.failed(keys)}
-    return Comparison(spec, tasks, set(store.done(keys)), values, rows, failures)
+    return VariantComparison(spec, tasks, set(store.done(keys)), values, rows, failures)
 
 
 def verdict(row: Ranked, baseline: str) -> str:
@@ -198,7 +198,7 @@ def header(spec: Spec) -> list[str]:
     return ["variant", "runs", first, "± seeds", "vs baseline", "p (t)", "p (ranks)", "verdict", *others]
 
 
-def cells(row: Ranked, comparison: Comparison) -> list[str]:
+def cells(row: Ranked, comparison: VariantComparison) -> list[str]:
     """Return a variant's row of the ranking as text."""
     first, *others = comparison.spec.metrics
     baseline = comparison.spec.baseline.name
@@ -215,7 +215,7 @@ def cells(row: Ranked, comparison: Comparison) -> list[str]:
     ]
 
 
-def as_text(comparison: Comparison) -> str:
+def as_text(comparison: VariantComparison) -> str:
     """Return the ranking as an aligned table."""
     rows = [header(comparison.spec), *(cells(row, comparison) for row in comparison.rows)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

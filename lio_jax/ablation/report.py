@@ -11,7 +11,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from lio_jax.ablation.ranking import Comparison, cells, header, number
+from lio_jax.ablation.ranking import VariantComparison, cells, header, number
 from lio_jax.ablation.spec import METRICS, TIME
 from lio_jax.ablation.store import Store
 from lio_jax.run.folder import write_text
@@ -126,12 +126,12 @@ figure{margin:0}.soft{color:#666;font-size:.9rem}pre{overflow-x:auto;background:
 """
 
 
-def write_report(comparison: Comparison, store: Store) -> None:
+def write_report(comparison: VariantComparison, store: Store) -> None:
     """Write report.html into the ablation's folder."""
     write_text(store.root / "report.html", report(comparison, store))
 
 
-def report(comparison: Comparison, store: Store) -> str:
+def report(comparison: VariantComparison, store: Store) -> str:
     """Return the page as HTML."""
     spec = comparison.spec
     total = len(comparison.tasks)
@@ -156,7 +156,7 @@ def report(comparison: Comparison, store: Store) -> str:
     return f"{head}<body>{''.join(parts)}</body></html>\n"
 
 
-def _explained(comparison: Comparison) -> str:
+def _explained(comparison: VariantComparison) -> str:
     return (
         f"Means over recordings and seeds; ranked by {comparison.metric}, incomplete variants last. "
         "± seeds: standard deviation over seeds of the mean over recordings. vs baseline: geometric mean of "
@@ -167,7 +167,7 @@ def _explained(comparison: Comparison) -> str:
     )
 
 
-def _pictures(comparison: Comparison) -> Iterable[str]:
+def _pictures(comparison: VariantComparison) -> Iterable[str]:
     by_variant = comparison.values[comparison.metric]
     label = _labelled(comparison.metric)
     if not by_variant:
@@ -198,7 +198,7 @@ def _pictures(comparison: Comparison) -> Iterable[str]:
         yield "</div>"
 
 
-def _failures(comparison: Comparison) -> Iterable[str]:
+def _failures(comparison: VariantComparison) -> Iterable[str]:
     if not comparison.failures:
         return
     yield "<h2>Failed</h2>"
@@ -213,7 +213,7 @@ def _folded(trace: str) -> str:
     return f"<details><summary>traceback</summary><pre>{escape(trace)}</pre></details>" if trace else ""
 
 
-def _runs(comparison: Comparison, store: Store) -> str:
+def _runs(comparison: VariantComparison, store: Store) -> str:
     metrics = comparison.spec.metrics
     rows = []
     for task in comparison.tasks:

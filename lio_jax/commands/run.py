@@ -20,7 +20,7 @@ from lio_jax.run.sinks import RunResult, Sink
 from lio_jax.run.track import ScanResult
 from lio_jax.settings.settings import Settings, load_settings, recipe_settings, with_overrides
 from lio_jax.settings.translate import ForeignKey, ForeignSettings, load_foreign_settings
-from lio_jax.viz.recording import Recording
+from lio_jax.viz.recording import ViewerRecording
 from lio_jax.viz.run_recording import RecordingSink
 
 
@@ -184,7 +184,7 @@ def run_into(
         sinks: list[Sink] = []
         if settings.run.output.recording:
             address = _live_viewer(stack) if live else None
-            recording = stack.enter_context(Recording(out / "recording.rrd", total, address))
+            recording = stack.enter_context(ViewerRecording(out / "recording.rrd", total, address))
             sinks.append(RecordingSink(recording, out, truth))
         sinks.append(_ProgressBar(total))
         result = run_sequence(sequence, settings, out, start, count, sinks)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 _Value = TypeVar("_Value")
 
 
-class Solution(NamedTuple):
+class ImplicitSolution(NamedTuple):
     """The result of a solve."""
 
     root: Float[Array, " d"]
@@ -32,7 +32,7 @@ class Problem(eqx.Module):
     Its functions must not close over arrays that are differentiated: such arrays belong in ``inputs``.
     """
 
-    solve: Callable[[Any], Solution]
+    solve: Callable[[Any], ImplicitSolution]
     """``inputs -> solution``. It may use any iteration."""
     probe: Callable[[Array, Any, Any], Any]
     """``(root, selection, inputs) -> probed``: the costly values that residual and report share."""
@@ -51,7 +51,7 @@ class Problem(eqx.Module):
     it is not differentiated itself."""
 
 
-def implicit(problem: Problem, inputs: Any) -> Solution:
+def implicit(problem: Problem, inputs: Any) -> ImplicitSolution:
     """Return the problem's solution with the derivative of the root of ``residual = 0``.
 
     By the implicit function theorem dx = -(dr/dx)^-1 (dr/dinputs) dinputs (Krantz & Parks, "The implicit
@@ -67,12 +67,12 @@ def implicit(problem: Problem, inputs: Any) -> Solution:
 
 
 @eqx.filter_custom_jvp
-def _implicit(problem: Problem, inputs: Any) -> Solution:
+def _implicit(problem: Problem, inputs: Any) -> ImplicitSolution:
     return problem.solve(inputs)
 
 
 @_implicit.def_jvp
-def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
+def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple[ImplicitSolution, ImplicitSolution]:
     problem, inputs = primals
     solution = _implicit(problem, inputs)
     root = solution.root
@@ -118,7 +118,7 @@ def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
         root_dot = -jnp.linalg.solve(slope, push)
     probed_dot = jax.tree.map(jnp.add, probed_push, felt(root_dot))
     _, reported_dot = jax.jvp(report, (root, smooth, moving), (root_dot, probed_dot, inputs_dot))
-    return solution, Solution(root_dot, _still(solution.selection), _tangent(reported_dot))
+    return solution, ImplicitSolution(root_dot, _still(solution.selection), _tangent(reported_dot))
 
 
 def _felt(problem: Problem, root: Array, inputs: Any, probed_along: Callable[[Array], Any]) -> Callable:

@@ -56,7 +56,7 @@ class Chain(eqx.Module):
         return Chain(self.count, self.gravity, self.prior, *rows)
 
 
-class Weights(NamedTuple):
+class FactorWeights(NamedTuple):
     """Weights of the measurements by the robust kernel, from 0 to 1; 0 where there is no measurement."""
 
     lidar: Float[Array, " n"]
@@ -76,7 +76,7 @@ class Normal(eqx.Module):
     """Gradient of the cost by each state's error."""
     cost: Float[Array, ""]
     """Negative log-density of states and measurements, without a constant."""
-    weights: Weights
+    weights: FactorWeights
     """Weights of the measurements at these states."""
 
 
@@ -127,7 +127,9 @@ def linearise(
         matrix=matrix,
         gradient=gradient,
         cost=sum((jnp.sum(term.cost) for term in unary + binary), jnp.zeros((), gradient.dtype)),
-        weights=Weights(lidar.weight, relative.weight if relative else None, gps.weight if gps else None),
+        weights=FactorWeights(
+            lidar.weight, relative.weight if relative else None, gps.weight if gps else None
+        ),
     )
 
 

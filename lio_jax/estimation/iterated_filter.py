@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.implicit import Problem, Solution, implicit
+from lio_jax.core.implicit import ImplicitSolution, Problem, implicit
 from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, LOST, NOT_FINITE
 from lio_jax.estimation.innovation import Innovation, innovation_of, square_root_information
 
@@ -112,7 +112,7 @@ def iterated_update(
         PH = prior.covariance @ H.T
         return _Blend(measured, H, PH, innovation_of(H @ PH, residual - H @ error, values))
 
-    def solve(inputs: tuple) -> Solution:
+    def solve(inputs: tuple) -> ImplicitSolution:
         prior, measure, _, first_aux, tolerance = inputs
 
         # jitted so that it is traced once for the shapes and the loop together
@@ -138,7 +138,7 @@ def iterated_update(
             blank = eqx.tree_at(lambda blank: blank.measured.aux, blank, first_aux)
         start = (error, jnp.int32(0), jnp.array(False), jnp.array(False), blank)
         error, iterations, done, lost, last = jax.lax.while_loop(unfinished, iterate, start)
-        return Solution(error, _Loop(last.measured.aux, iterations, done, lost), last)
+        return ImplicitSolution(error, _Loop(last.measured.aux, iterations, done, lost), last)
 
     def probe(error: Array, loop: _Loop, inputs: tuple) -> Measurement:
         prior, _, again, *_ = inputs

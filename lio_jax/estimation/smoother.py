@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.implicit import Problem, Solution, implicit
+from lio_jax.core.implicit import ImplicitSolution, Problem, implicit
 from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, NOT_FINITE
 from lio_jax.estimation.block_tridiagonal import BlockTridiagonal, factorise, inverse_blocks, solve
 from lio_jax.estimation.chain import Chain, Normal, information_of, linearise
@@ -107,7 +107,7 @@ def smooth(
     )
 
 
-def _solve(inputs: Any) -> Solution:
+def _solve(inputs: Any) -> ImplicitSolution:
     chain, guess, tolerance, max_iterations = inputs
     information = information_of(chain)
 
@@ -148,7 +148,7 @@ def _solve(inputs: Any) -> Solution:
     loop = jax.lax.while_loop(unfinished, iterate, start)
     root = jnp.zeros(blank.gradient.size, blank.gradient.dtype)
     kept = _Found(loop.states, loop.decrement, loop.iterations, loop.done)
-    return Solution(root, kept, (loop.states, loop.normal))
+    return ImplicitSolution(root, kept, (loop.states, loop.normal))
 
 
 def _damped(matrix: BlockTridiagonal, damping: Array) -> BlockTridiagonal:

@@ -21,7 +21,7 @@ _CANDIDATES = 40
 
 
 @dataclass(frozen=True)
-class Window:
+class ScanWindow:
     """A window of consecutive scans."""
 
     first: int
@@ -45,12 +45,12 @@ class Sampled:
     """First and last time of receipt (ns) of each window in a bag; else first scan and number of scans."""
     _parts: list[RosbagSequence]
 
-    def windows(self) -> Iterator[Window]:
+    def windows(self) -> Iterator[ScanWindow]:
         """Yield the windows; each one is decoded when it is asked for."""
         for part in self._parts:
-            yield Window(0, False, _first(part, WINDOW_SCANS))
+            yield ScanWindow(0, False, _first(part, WINDOW_SCANS))
         for first, count in self._places:
-            yield Window(first, True, list(self.sequence.scans(first, count)))
+            yield ScanWindow(first, True, list(self.sequence.scans(first, count)))
 
 
 def sampled(sequence: Sequence) -> Sampled:

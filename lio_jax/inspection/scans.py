@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.data.sequence import LidarScan
-from lio_jax.inspection.sampling import Window
+from lio_jax.inspection.sampling import ScanWindow
 
 FEW_POINTS = 1000
 GAP_FACTOR = 1.8
@@ -35,7 +35,7 @@ class ScanSummary:
     """Number of points in each interval of range."""
     rings: set[int] = field(default_factory=set)
 
-    def add(self, window: Window) -> None:
+    def add(self, window: ScanWindow) -> None:
         """Add the consecutive scans of a window."""
         stamps = [scan.stamp_ns for scan in window.scans]
         self.steps_ns += np.diff(stamps).tolist()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.loops.params import BackEndSettings
-from lio_jax.loops.place_descriptor import Places
+from lio_jax.loops.place_descriptor import DescribedPlaces
 from lio_jax.loops.proposals import (
     AT_LEAST,
     Pair,
@@ -148,7 +148,7 @@ class LoopCloser:
         """
         sizes, limits = settings.run.loops, settings.values["loop"]
         self._settings, self._limits = settings, limits
-        self._places = Places(sizes.rings, sizes.sectors, limits["descriptor_range"])
+        self._places = DescribedPlaces(sizes.rings, sizes.sectors, limits["descriptor_range"])
         self._consensus = Consensus(limits)
         self._pairs = read_pairs(Path(sizes.pairs)) if sizes.pairs else []
         self._run: list[float] = []

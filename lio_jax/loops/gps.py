@@ -40,7 +40,7 @@ _MOST_ALIKE = 0.98
 """Largest correlation of one residual with the next that is used."""
 
 
-class Alignment(NamedTuple):
+class EnuAlignment(NamedTuple):
     """The level frame of the odometry in the fixes' frame."""
 
     T_enu_odom: _Array
@@ -76,7 +76,7 @@ class _Pairs(NamedTuple):
 
 def alignment(
     positions_odom: _Array, fixes: _Array, covariances: _Array, yaw_sigma: float
-) -> Alignment | None:
+) -> EnuAlignment | None:
     """Return the yaw and translation that align an odometry with fixes; None while the yaw is not observable.
 
     The alignment minimises the sum of r' C^-1 r with r = Rz(yaw) p + t - f. The terms of fixes that
@@ -106,7 +106,7 @@ def alignment(
         return None
     T_enu_odom = np.eye(4)
     T_enu_odom[:3, :3], T_enu_odom[:3, 3] = _about_z(yaw), shift
-    return Alignment(T_enu_odom, covariance, inlier)
+    return EnuAlignment(T_enu_odom, covariance, inlier)
 
 
 def _robust(pairs: _Pairs) -> tuple[float, _Array, _Array]:

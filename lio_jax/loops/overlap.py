@@ -19,7 +19,7 @@ _VIEW = (3.0, 40.0)
 """Smallest and largest range of the map's points that are compared with the view, m."""
 
 
-class Agreement:
+class OverlapAgreement:
     """Points of a map, in a tree for nearest neighbours."""
 
     def __init__(self, target: NDArray[np.float32]) -> None:
@@ -112,7 +112,7 @@ class Candidate:
     """Angle between the source's aligned vertical and its current one, rad."""
 
 
-class Comparison:
+class CloudComparison:
     """The surroundings of two keyframes, which can be compared under any alignment."""
 
     def __init__(
@@ -126,7 +126,7 @@ class Comparison:
             ours: (n, 3) points on upright objects of the source, m, in its level axes.
             within: largest distance to a target's point at which a source's point agrees, m.
         """
-        self._agreement, self._stations = Agreement(theirs), cKDTree(stations)
+        self._agreement, self._stations = OverlapAgreement(theirs), cKDTree(stations)
         self._ours, self._within = ours, within
 
     def candidates(self, result: Alignments, poses: _Array) -> list[Candidate]:

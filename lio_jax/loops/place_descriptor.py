@@ -62,7 +62,7 @@ class Likeness:
         return np.linalg.inv(target) @ turned
 
 
-class Places:
+class DescribedPlaces:
     """The descriptors of all keyframes so far."""
 
     def __init__(self, rings: int, sectors: int, reach: float) -> None:

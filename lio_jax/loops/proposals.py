@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.core.timestamps import seconds_to_ns
 from lio_jax.loops.keyframe import Keyframe
-from lio_jax.loops.place_descriptor import Likeness, Places
+from lio_jax.loops.place_descriptor import DescribedPlaces, Likeness
 
 _ACROSS = 1.0
 """Length of odometry that has the same uncertainty as a closed loop, m."""
@@ -277,7 +277,7 @@ def external_proposal(
 
 
 def described_proposals(
-    places: Places,
+    places: DescribedPlaces,
     poses: NDArray[np.float64],
     old: NDArray[np.bool_],
     metres: NDArray[np.float64],

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from lio_jax.core.leaf import numbers_of, traced
 from lio_jax.loops.alignment import aligned
 from lio_jax.loops.keyframe import Keyframe, level_points, padded, thinned
-from lio_jax.loops.overlap import LEAST_POINTS, Candidate, Comparison, conflict
+from lio_jax.loops.overlap import LEAST_POINTS, Candidate, CloudComparison, conflict
 from lio_jax.loops.params import AlignmentParams, BackEndSettings
 from lio_jax.loops.proposals import Proposal, is_old, possible_error
 from lio_jax.pose_graph.graph import heading_of
@@ -209,7 +209,7 @@ def verify(
         sizes.starts,
         _aligning_params(settings),
     )
-    comparison = Comparison(theirs, stations, ours[our_upright], limits["overlap_distance"])
+    comparison = CloudComparison(theirs, stations, ours[our_upright], limits["overlap_distance"])
     candidates = comparison.candidates(result, poses[[target, source]])
     seen = level_points(keyframes, poses, source, [source], TARGET_REACH)
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.keyframes import KeyframeCloud, Keyframes, next_to_enter, with_keyframe
 from lio_jax.mapping.params import CubeGridParams, CubeParams, FeatureMapParams, PointMapParams, SubmapParams
-from lio_jax.mapping.point_map import EDGE, Insertion, PointMap, empty_map, insert, move_cube, shift_box
+from lio_jax.mapping.point_map import EDGE, PointInsertion, PointMap, empty_map, insert, move_cube, shift_box
 from lio_jax.mapping.voxel_map import anchor_of
 
 
@@ -73,7 +73,7 @@ def added_to(
     point_map: PointMapParams,
     half_sides: Float[Array, "*d"],
     follow: Follow,
-) -> tuple[FeatureMap, Insertion, Insertion]:
+) -> tuple[FeatureMap, PointInsertion, PointInsertion]:
     """Return the map with points added, its box moved to the sensor; and what was added of either kind.
 
     Args:
@@ -135,7 +135,7 @@ def added_to_cubes(
     map_params: FeatureMapParams,
     point_map: PointMapParams,
     cubes: CubeGridParams,
-) -> tuple[FeatureMap, Insertion, Insertion]:
+) -> tuple[FeatureMap, PointInsertion, PointInsertion]:
     """Return the map with a scan's points, its grid shifted to the sensor; and what was added of either kind.
 
     Args:
@@ -175,7 +175,7 @@ def with_scan(
     map_params: FeatureMapParams,
     point_map: CubeParams,
     settings: SubmapParams,
-) -> tuple[Submap, Frames, FeaturePoints, tuple[Insertion, Insertion]]:
+) -> tuple[Submap, Frames, FeaturePoints, tuple[PointInsertion, PointInsertion]]:
     """Return the submap with a scan as a keyframe, and with one that the vehicle comes back to, if any.
 
     Args:

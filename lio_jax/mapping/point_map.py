@@ -33,7 +33,7 @@ class PointMap(eqx.Module):
     """The block at the cube's centre."""
 
 
-class Insertion(eqx.Module):
+class PointInsertion(eqx.Module):
     """The result of an insertion."""
 
     added: Bool[Array, " m"]
@@ -118,7 +118,7 @@ def insert(
     voxel_size: Float32[Array, ""],
     half_side: Float32[Array, "*d"],
     nearer_by: Float32[Array, ""],
-) -> tuple[PointMap, Insertion]:
+) -> tuple[PointMap, PointInsertion]:
     """Keep in each voxel the point nearest to its centre: the one that the map holds, or one of ``points``.
 
     Args:
@@ -153,7 +153,7 @@ def insert(
         offset = points[:, axis] - (local[:, axis] + 0.5) * EDGE * voxel_size
         point = point.at[target, axis * VOXELS + voxel].set(offset, mode="drop")
     homeless = jnp.sum(inside & (slot < 0), dtype=jnp.int32)
-    return PointMap(keys, point, best, pmap.cube), Insertion(added, homeless)
+    return PointMap(keys, point, best, pmap.cube), PointInsertion(added, homeless)
 
 
 def _inside(

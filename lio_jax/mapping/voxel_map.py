@@ -54,7 +54,7 @@ class Insertion(eqx.Module):
     """Number of points whose voxel found no free slot, because the table is too full."""
 
 
-class Planes(eqx.Module):
+class VoxelPlanes(eqx.Module):
     """The plane and the distribution of the map's points around each of k queries."""
 
     mean: Float32[Array, "k 3"]
@@ -104,7 +104,7 @@ def query_nearest(
     anchor: Int32[Array, "3"],
     voxel_size: Float32[Array, ""],
     min_points: Float32[Array, ""],
-) -> Planes:
+) -> VoxelPlanes:
     """Return, for each point, the distribution with the nearest mean among four voxels.
 
     The four voxels are the point's own voxel and, along each axis, the face neighbour on the nearer side.
@@ -133,7 +133,7 @@ def query_nearest(
     nearest = computed_once(nearest)
     found = jnp.maximum(nearest, 0)
     plane = _take(vmap.plane, found)
-    return Planes(
+    return VoxelPlanes(
         mean=_mean(vmap, found, _take(vmap.voxel, found) - anchor, voxel_size),
         normal=plane[:, :3],
         variances=plane[:, 3:],

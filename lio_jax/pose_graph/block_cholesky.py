@@ -222,7 +222,7 @@ class Order:
 
 
 @dataclass(frozen=True)
-class Plan:
+class ChainPlan:
     """The plan of a factorisation, for all matrices of d by d blocks with one pattern."""
 
     order: Order
@@ -237,10 +237,10 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Factor:
+class ChainFactor:
     """The Cholesky factor of a matrix."""
 
-    plan: Plan
+    plan: ChainPlan
     """Plan of the matrix's pattern."""
     levels: tuple["_Columns", ...]
     """Columns of the nodes of each level."""
@@ -270,7 +270,7 @@ def order_of(count: int, pairs: NDArray[np.int64], worth_a_level: int = WORTH_A_
     return Order(reduction, elimination_tree(len(reduction.kept), reduction.pairs))
 
 
-def plan_of(order: Order, size: int) -> Plan:
+def plan_of(order: Order, size: int) -> ChainPlan:
     """Return the plan of a factorisation.
 
     Args:
@@ -278,10 +278,10 @@ def plan_of(order: Order, size: int) -> Plan:
         size: number of rows of a block.
     """
     reduction = order.reduction
-    return Plan(order, multifrontal.plan_of(reduction.pairs, size, order.tree))
+    return ChainPlan(order, multifrontal.plan_of(reduction.pairs, size, order.tree))
 
 
-def factorise(plan: Plan, diagonal: _Array, pairs: _Array) -> Factor:
+def factorise(plan: ChainPlan, diagonal: _Array, pairs: _Array) -> ChainFactor:
     """Return the Cholesky factor of a symmetric matrix.
 
     Args:
@@ -294,13 +294,13 @@ def factorise(plan: Plan, diagonal: _Array, pairs: _Array) -> Factor:
     """
     reduction = plan.order.reduction
     if not reduction.levels:
-        return Factor(plan, (), multifrontal.factorise(plan.fronts, np.concatenate([diagonal, pairs])))
+        return ChainFactor(plan, (), multifrontal.factorise(plan.fronts, np.concatenate([diagonal, pairs])))
     size = plan.size
     # the last block stays zero: it stands for neighbours that do not exist
     blocks = np.concatenate([diagonal, pairs, np.zeros((1, size, size))])
     columns = tuple(_eliminated(level, blocks) for level in reduction.levels)
     left = (reduction.sums @ blocks.reshape(len(blocks), -1)).reshape(-1, size, size)
-    return Factor(plan, columns, multifrontal.factorise(plan.fronts, left))
+    return ChainFactor(plan, columns, multifrontal.factorise(plan.fronts, left))
 
 
 def _eliminated(level: Level, blocks: _Array) -> _Columns:
@@ -330,7 +330,7 @@ def _eliminated(level: Level, blocks: _Array) -> _Columns:
     return _Columns(root, adjacent)
 
 
-def solve(factor: Factor, right: _Array) -> _Array:
+def solve(factor: ChainFactor, right: _Array) -> _Array:
     """Return the solution x of A x = right.
 
     Args:

@@ -20,7 +20,7 @@ _Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Edge:
+class G2oEdge:
     """A measured relative pose between two vertices."""
 
     i: int
@@ -33,7 +33,7 @@ class Edge:
     """(6, 6) information of the right perturbation of T_i_j: rotation (rad) before translation (m)."""
 
 
-def write_g2o(path: Path, poses: NDArray[np.float64], edges: list[Edge]) -> None:
+def write_g2o(path: Path, poses: NDArray[np.float64], edges: list[G2oEdge]) -> None:
     """Write vertices in space and their edges.
 
     The information in the file is that of (translation, rotation vector), as in gtsam.

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike, NDArray
 
-from lio_jax.core.implicit import Problem, implicit
-from lio_jax.core.implicit import Solution as Root
+from lio_jax.core.implicit import ImplicitSolution, Problem, implicit
 from lio_jax.pose_graph.block_cholesky import factorise
 from lio_jax.pose_graph.block_cholesky import solve as solve_factored
 from lio_jax.pose_graph.descent import Limits
@@ -50,7 +49,7 @@ def solved_poses(graph: PoseGraph, limits: Limits = _STRICT) -> Poses:
     return implicit(problem, (graph, held)).reported
 
 
-def _root(limits: Limits, inputs: tuple[PoseGraph, Array]) -> Root:
+def _root(limits: Limits, inputs: tuple[PoseGraph, Array]) -> ImplicitSolution:
     graph, _ = inputs
     poses = solve(graph, limits=limits).poses
     unmoved = jnp.zeros(len(graph.fixed) * graph.poses.tangent_dim, graph.information.dtype)
@@ -58,7 +57,7 @@ def _root(limits: Limits, inputs: tuple[PoseGraph, Array]) -> Root:
         (numbers,) = jax.tree.leaves(poses)
         step = _solve_hessian(unmoved, numbers, inputs, _gradient(unmoved, numbers, *inputs))
         poses = _poses_at(-step, numbers, *inputs)
-    return Root(unmoved, jax.tree.leaves(poses)[0], poses)
+    return ImplicitSolution(unmoved, jax.tree.leaves(poses)[0], poses)
 
 
 @jax.jit

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from lio_jax.pose_graph.block_cholesky import Order, Plan, order_of, plan_of
+from lio_jax.pose_graph.block_cholesky import ChainPlan, Order, order_of, plan_of
 from lio_jax.pose_graph.graph import POSITION, PRIOR, PoseGraph
 
 
@@ -74,12 +74,12 @@ class Structure:
         return order_of(self.count, self.pairs)
 
     @cached_property
-    def plan(self) -> Plan:
+    def plan(self) -> ChainPlan:
         """Return the plan for matrices with blocks of a tangent vector's size."""
         return plan_of(self.order, self.tangent_size)
 
     @cached_property
-    def plan_of_coordinates(self) -> Plan:
+    def plan_of_coordinates(self) -> ChainPlan:
         """Return the plan for matrices with blocks of 3 rows in space, 2 in the plane."""
         return plan_of(self.order, 3 if self.tangent_size == 6 else 2)
 

@@ -29,7 +29,7 @@ from lio_jax.lidar.features import (
 )
 from lio_jax.mapping.feature_map import FeaturePoints, Frames, Submap, with_scan
 from lio_jax.mapping.keyframes import is_due
-from lio_jax.mapping.point_map import Insertion
+from lio_jax.mapping.point_map import PointInsertion
 from lio_jax.recipes import recipe
 from lio_jax.recipes.inertial_filter import lidar_pose
 from lio_jax.recipes.lio_sam_params import LioSamConfig, LioSamParams
@@ -316,9 +316,9 @@ class Addition(eqx.Module):
     frames: Frames
     placed: FeaturePoints
     """The scan's features, each kind in its frame."""
-    corner: Insertion
+    corner: PointInsertion
     """The scan's corners first, then those of a keyframe that the vehicle comes back to."""
-    surface: Insertion
+    surface: PointInsertion
     """Likewise."""
 
 

@@ -12,7 +12,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.geometry import rotation_matrix
-from lio_jax.core.implicit import Problem, Solution, implicit
+from lio_jax.core.implicit import ImplicitSolution, Problem, implicit
 from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, LOST
 from lio_jax.registration.params import GaussNewtonMatch, RegistrationParams
 from lio_jax.registration.scan_match import Association, NormalEquations, ScanMatch
@@ -119,7 +119,7 @@ class _End(eqx.Module):
     """The directions of the last step."""
 
 
-def _solve(max_steps: int, max_searches: Int32[Array, ""], match: ScanMatch[Any, Any]) -> Solution:
+def _solve(max_steps: int, max_searches: Int32[Array, ""], match: ScanMatch[Any, Any]) -> ImplicitSolution:
     settings = match.registration
     assert isinstance(settings, GaussNewtonMatch)
 
@@ -151,7 +151,7 @@ def _solve(max_steps: int, max_searches: Int32[Array, ""], match: ScanMatch[Any,
         search,
         (jnp.int32(0), jnp.array(False), start, NormalEquations.nothing(dtype)),
     )
-    return Solution(jnp.zeros(6, dtype), end, equations)
+    return ImplicitSolution(jnp.zeros(6, dtype), end, equations)
 
 
 def _linearised_again(step: Float[Array, "6"], end: _End, match: ScanMatch[Any, Any]) -> NormalEquations:

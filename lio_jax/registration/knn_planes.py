@@ -19,7 +19,7 @@ _Coordinates = Float32[Array, "n k"]
 """One coordinate of n points in each of k columns."""
 
 
-class Planes(eqx.Module):
+class FittedPlanes(eqx.Module):
     """The plane that each point lies on, in world axes from the frame's origin."""
 
     normal: Float32[Array, "k 3"]
@@ -30,10 +30,10 @@ class Planes(eqx.Module):
     """True where a point has a plane."""
 
 
-def no_planes(mask: Bool[Array, " k"]) -> Planes:
+def no_planes(mask: Bool[Array, " k"]) -> FittedPlanes:
     """Return planes of none of the points."""
     zeros = jnp.zeros((*mask.shape, 3), jnp.float32)
-    return Planes(zeros, zeros[:, 0], jnp.zeros_like(mask))
+    return FittedPlanes(zeros, zeros[:, 0], jnp.zeros_like(mask))
 
 
 def associate(
@@ -45,7 +45,7 @@ def associate(
     map_params: MapParams,
     knn: KnnParams,
     neighbours: int,
-) -> Planes:
+) -> FittedPlanes:
     """Return the plane through the nearest map points of each point at a pose.
 
     A plane is valid if all neighbours lie within ``knn.radius`` of the point and within
@@ -64,12 +64,12 @@ def planes_near(
     voxel_size: Float[Array, ""],
     knn: KnnParams,
     neighbours: int,
-) -> Planes:
+) -> FittedPlanes:
     """Return the planes of :func:`associate` for points in the frame anchored at ``anchor``, m."""
     x, y, z, enough = neighbours_within(pmap, placed, mask, anchor, voxel_size, knn.radius, neighbours)
     planes, farthest = fit_planes(x, y, z)
     valid = enough & (farthest <= knn.plane_tolerance.astype(jnp.float32))
-    return Planes(planes.normal, planes.offset, valid)
+    return FittedPlanes(planes.normal, planes.offset, valid)
 
 
 def neighbours_within(
@@ -102,7 +102,9 @@ def neighbours_within(
     return x, y, z, enough
 
 
-def fit_planes(x: _Coordinates, y: _Coordinates, z: _Coordinates) -> tuple[Planes, Float32[Array, " k"]]:
+def fit_planes(
+    x: _Coordinates, y: _Coordinates, z: _Coordinates
+) -> tuple[FittedPlanes, Float32[Array, " k"]]:
     """Fit a plane to each column of n points: the one with the least sum of squared distances.
 
     FAST-LIO2 itself minimises the error of m'p = -1, whose solution leans towards the world's origin and
@@ -118,7 +120,7 @@ def fit_planes(x: _Coordinates, y: _Coordinates, z: _Coordinates) -> tuple[Plane
     _, normal = computed_once(eigenvalues_and_normal3(moments[:, :3], moments[:, 3:]))
     nx, ny, nz = normal[:, 0], normal[:, 1], normal[:, 2]
     farthest = jnp.max(jnp.abs(nx * qx + ny * qy + nz * qz), 0)
-    return Planes(normal, -(nx * cx + ny * cy + nz * cz), jnp.ones(x.shape[1], bool)), farthest
+    return FittedPlanes(normal, -(nx * cx + ny * cy + nz * cz), jnp.ones(x.shape[1], bool)), farthest
 
 
 def spread(
@@ -150,7 +152,7 @@ def match_score(
 
 
 def linearise(
-    planes: Planes,
+    planes: FittedPlanes,
     points: Float[Array, "k 3"],
     T_world_lidar: jaxlie.SE3,
     frame: Frame,
@@ -189,7 +191,7 @@ def linearise(
     )
 
 
-class ScanToPoints(ScanMatch[Array, Planes]):
+class ScanToPoints(ScanMatch[Array, FittedPlanes]):
     """A scan against the planes through its nearest neighbours in a map of points."""
 
     map: PointMap
@@ -205,15 +207,15 @@ class ScanToPoints(ScanMatch[Array, Planes]):
     def together(self, points: Float[Array, "k 3"]) -> tuple[Float[Array, "k 3"], Bool[Array, " k"]]:
         return points, self.mask
 
-    def unmatched(self) -> Planes:
+    def unmatched(self) -> FittedPlanes:
         return no_planes(self.mask)
 
-    def associate(self, points: Float[Array, "k 3"], T_world_lidar: jaxlie.SE3) -> Planes:
+    def associate(self, points: Float[Array, "k 3"], T_world_lidar: jaxlie.SE3) -> FittedPlanes:
         settings = self.map_params, self.knn, self.neighbours
         return associate(self.map, points, self.mask, T_world_lidar, self.frame(), *settings)
 
     def linearise(
-        self, T_world_lidar: jaxlie.SE3, found: Planes, iteration: Int32[Array, ""]
+        self, T_world_lidar: jaxlie.SE3, found: FittedPlanes, iteration: Int32[Array, ""]
     ) -> NormalEquations:
         points = self.points_at(T_world_lidar)
         return linearise(found, points, T_world_lidar, self.frame(), self.knn, self.lidar)

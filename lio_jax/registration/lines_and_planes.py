@@ -17,7 +17,7 @@ from lio_jax.core.xla import computed_once
 from lio_jax.mapping.feature_map import FeaturePoints, Frames
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.point_map import PointMap
-from lio_jax.registration.knn_planes import Planes, match_score, neighbours_within, no_planes, spread
+from lio_jax.registration.knn_planes import FittedPlanes, match_score, neighbours_within, no_planes, spread
 from lio_jax.registration.params import LineFitParams, ScoredFitParams
 from lio_jax.registration.scan_match import NormalEquations
 
@@ -28,9 +28,9 @@ _Coordinates = Float32[Array, "n k"]
 class Lines(eqx.Module):
     """The line that each point lies on, as two planes; both have the same ``valid``."""
 
-    first: Planes
+    first: FittedPlanes
     """First plane through each line."""
-    second: Planes
+    second: FittedPlanes
     """Second plane through each line, normal to the first."""
 
 
@@ -38,7 +38,7 @@ class LinesAndPlanes(eqx.Module):
     """What corners and surface points were associated with, each in its frame."""
 
     lines: Lines
-    planes: Planes
+    planes: FittedPlanes
 
 
 def no_lines_and_planes(points: FeaturePoints) -> LinesAndPlanes:
@@ -59,8 +59,8 @@ def line_through(
     """
     cx, cy, cz = centre
 
-    def plane(normal: Array) -> Planes:
-        return Planes(normal, -(normal[:, 0] * cx + normal[:, 1] * cy + normal[:, 2] * cz), valid)
+    def plane(normal: Array) -> FittedPlanes:
+        return FittedPlanes(normal, -(normal[:, 0] * cx + normal[:, 1] * cy + normal[:, 2] * cz), valid)
 
     first, second = computed_once(across(direction))
     return Lines(plane(first), plane(second))
@@ -212,7 +212,7 @@ class _Rows(eqx.Module):
     range_squared: Float[Array, " k"]
 
     @staticmethod
-    def of(planes: Planes, points: Array, T_world_lidar: jaxlie.SE3, frame: Frame) -> "_Rows":
+    def of(planes: FittedPlanes, points: Array, T_world_lidar: jaxlie.SE3, frame: Frame) -> "_Rows":
         arm, placed = frame.place(jnp.where(planes.valid[:, None], points, 0.0), T_world_lidar)
         normal = jnp.where(planes.valid[:, None], planes.normal, 0.0)
         (px, py, pz), (rx, ry, rz), (nx, ny, nz) = computed_once(

@@ -14,7 +14,7 @@ from lio_jax.lidar.features import FeatureCloud
 from lio_jax.mapping.feature_map import FeaturePoints, Frames
 from lio_jax.mapping.frame import Frame
 from lio_jax.registration.feature_match import FeatureMatch
-from lio_jax.registration.knn_planes import Planes
+from lio_jax.registration.knn_planes import FittedPlanes
 from lio_jax.registration.lines_and_planes import Lines, LinesAndPlanes, line_through
 from lio_jax.registration.params import ScanToScanParams
 from lio_jax.registration.ring_index import Nearest, Queries, RingIndex, nearest_by_ring, ring_index
@@ -106,7 +106,7 @@ def _lines(index: RingIndex, found: Nearest) -> Lines:
     return line_through(here, direction, valid)
 
 
-def _planes(index: RingIndex, found: Nearest) -> Planes:
+def _planes(index: RingIndex, found: Nearest) -> FittedPlanes:
     places = (found.nearest, found.same_ring, found.other_ring)
     here, along, aside = computed_once(tuple(index.at(jnp.maximum(place, 0)) for place in places))
     along, aside = _difference(along, here), _difference(aside, here)
@@ -115,7 +115,7 @@ def _planes(index: RingIndex, found: Nearest) -> Planes:
     valid = (found.same_ring >= 0) & (found.other_ring >= 0) & (area > 0)
     nx, ny, nz = (axis / jnp.where(valid, area, 1.0) for axis in normal)
     offset = -(nx * here[0] + ny * here[1] + nz * here[2])
-    return Planes(jnp.stack([nx, ny, nz], -1), offset, valid)
+    return FittedPlanes(jnp.stack([nx, ny, nz], -1), offset, valid)
 
 
 def _difference(left: _Vectors, right: _Vectors) -> _Vectors:

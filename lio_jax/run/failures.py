@@ -96,7 +96,7 @@ _UNLIKELY_NIS = 22.46
 
 
 @dataclass(frozen=True)
-class Evidence:
+class ScanEvidence:
     """The results for one scan from which failures are found, on the host."""
 
     points: int
@@ -119,7 +119,7 @@ class Evidence:
     """The smoother reached its largest number of linearisations."""
 
 
-def failure_of(now: Evidence, before: Evidence | None, settings: Settings) -> str:
+def failure_of(now: ScanEvidence, before: ScanEvidence | None, settings: Settings) -> str:
     """Return one sentence for each thing that went wrong with a scan, or "".
 
     A speed or a bias beyond ``params.limits`` is reported once, when it passes the limit (LIO-SAM's
@@ -166,7 +166,7 @@ def longest_gap(samples: ImuBatch, start: float, end: float) -> float:
     return float(np.max(np.diff(within)[inner], initial=0.0))
 
 
-def _match_failure(now: Evidence, settings: Settings) -> str:
+def _match_failure(now: ScanEvidence, settings: Settings) -> str:
     found = now.registration
     if now.points == 0:
         return "it holds no points; the pose is the prediction."
@@ -203,7 +203,7 @@ def _not_finite(found: Any) -> str:
 
 
 def _limited(
-    now: Evidence, before: Evidence | None, limits: dict[str, Any]
+    now: ScanEvidence, before: ScanEvidence | None, limits: dict[str, Any]
 ) -> list[tuple[tuple[str, str], float, float, str]]:
     """Return for each exceeded limit: its words, the value now, the value before, and the limit's name."""
     watched = (
@@ -219,7 +219,7 @@ def _limited(
     return rows
 
 
-def _cause(now: Evidence) -> str:
+def _cause(now: ScanEvidence) -> str:
     """Return the most likely cause of the estimate's deviation."""
     suspects = _suspects(now) + ["the scan was not matched"] * now.lost
     if suspects:
@@ -230,7 +230,7 @@ def _cause(now: Evidence) -> str:
     )
 
 
-def _suspects(now: Evidence) -> list[str]:
+def _suspects(now: ScanEvidence) -> list[str]:
     found = now.registration
     suspects = []
     if _gap(now) > LONGEST_GAP:
@@ -249,5 +249,5 @@ def _suspects(now: Evidence) -> list[str]:
     return suspects
 
 
-def _gap(now: Evidence) -> float:
+def _gap(now: ScanEvidence) -> float:
     return now.imu_gap_s or 0.0

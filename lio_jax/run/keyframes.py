@@ -14,7 +14,7 @@ from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import atomic_path, read_arrays
 from lio_jax.core.geometry import carried
 from lio_jax.loops.keyframe import Keyframe
-from lio_jax.pose_graph.g2o import Edge
+from lio_jax.pose_graph.g2o import G2oEdge
 from lio_jax.run.track import ScanResult
 from lio_jax.settings.settings import Settings
 
@@ -97,7 +97,7 @@ def keyframe_indices(poses: NDArray[np.float64], distance: float, angle: float) 
     return chosen
 
 
-def odometry_edges(poses: NDArray[np.float64], covariances: NDArray[np.float64]) -> list[Edge]:
+def odometry_edges(poses: NDArray[np.float64], covariances: NDArray[np.float64]) -> list[G2oEdge]:
     """Return the edges between consecutive poses, under the assumption of independent errors.
 
     A relative pose T_i_j = T_i^-1 T_j has the covariance S_j + A S_i A', with A the adjoint of T_j_i. Where a
@@ -113,7 +113,7 @@ def odometry_edges(poses: NDArray[np.float64], covariances: NDArray[np.float64])
         T_i_j = np.linalg.inv(poses[i]) @ poses[i + 1]
         covariance = covariances[i + 1] + carried(covariances[i], np.linalg.inv(T_i_j))
         known = np.isfinite(covariance).all()
-        edges.append(Edge(i, i + 1, T_i_j, np.linalg.inv(covariance if known else _LOOSE)))
+        edges.append(G2oEdge(i, i + 1, T_i_j, np.linalg.inv(covariance if known else _LOOSE)))
     return edges
 
 

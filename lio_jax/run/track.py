@@ -15,7 +15,7 @@ from lio_jax.core.xla import programs
 from lio_jax.data.sequence import LidarScan
 from lio_jax.recipes.params import RecipeParams as Params
 from lio_jax.recipes.transforms import RecipeLike, Stepper, reopened
-from lio_jax.run.failures import Evidence, failure_of, longest_gap
+from lio_jax.run.failures import ScanEvidence, failure_of, longest_gap
 from lio_jax.run.scan_inputs import ImuFeed, bucket_for, padded
 from lio_jax.settings.settings import Settings, recipe_of
 
@@ -119,13 +119,13 @@ class ResultBuilder:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._before: Evidence | None = None
+        self._before: ScanEvidence | None = None
 
     def __call__(
         self, fed: "ScanInput", nav: Any, registration: Any, output: Any, step_ms: float
     ) -> ScanResult:
         """Return the result of a scan; ``nav`` and ``registration`` have numpy leaves."""
-        evidence = Evidence(
+        evidence = ScanEvidence(
             points=fed.count,
             nav=nav,
             registration=registration,

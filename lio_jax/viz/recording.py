@@ -103,7 +103,7 @@ _CORRECTED_COLOUR, _CLOSED_COLOUR, _REFUSED_COLOUR = (148, 103, 189), (44, 160, 
 _ARROW_M = 5.0
 
 
-class Recording:
+class ViewerRecording:
     """A context manager that writes a hidden file and renames it to ``path`` if no exception ends the block.
 
     Entities: world/lidar (pose), world/lidar/scan (compensated), world/lidar/raw, world/lidar/corners and
@@ -288,7 +288,7 @@ class Recording:
         except OSError as error:
             raise LioJaxError(f"{self._path}: the recording could not be written ({error}).") from None
 
-    def __enter__(self) -> "Recording":
+    def __enter__(self) -> "ViewerRecording":
         return self
 
     def __exit__(

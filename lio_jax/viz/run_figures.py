@@ -14,7 +14,7 @@ from lio_jax.data.trajectory import Trajectory
 from lio_jax.evaluation.kitti_segments import relative_errors, segment_ends
 from lio_jax.evaluation.trajectory_error import position_errors
 from lio_jax.viz.html import figure
-from lio_jax.viz.run_record import Comparison, RunRecord
+from lio_jax.viz.run_record import RunRecord, TruthComparison
 from lio_jax.viz.svg import WIDTH, Line, box_chart, empty, equal_axes, line_chart, plan_chart, stack_chart
 
 _INK = (108, 122, 136)
@@ -138,7 +138,7 @@ def from_the_side(run: RunRecord) -> str:
     return figure("From the side", line_chart(lines, _WAY, "z [m]"), "Height over the way.", legend)
 
 
-def errors(run: RunRecord, compared: Comparison) -> list[str]:
+def errors(run: RunRecord, compared: TruthComparison) -> list[str]:
     """Return position and attitude error over the distance travelled and over time."""
     matched = compared.matched
     metres = position_errors(compared.alignment, matched.estimate.poses, matched.reference.poses)
@@ -162,7 +162,7 @@ def errors(run: RunRecord, compared: Comparison) -> list[str]:
     return drawn
 
 
-def relative_error_boxes(compared: Comparison) -> list[str]:
+def relative_error_boxes(compared: TruthComparison) -> list[str]:
     """Return the relative pose error over several distances, from every pose on."""
     metres, degrees = relative_error_groups(compared)
     caption = "From every pose on; box: quartiles, whiskers: 5 and 95 %, dot: largest."
@@ -172,7 +172,7 @@ def relative_error_boxes(compared: Comparison) -> list[str]:
     ]
 
 
-def relative_error_groups(compared: Comparison) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
+def relative_error_groups(compared: TruthComparison) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
     """Return errors in % and in deg by distance, for the longest distances with enough pairs."""
     matched = compared.matched
     reference = matched.reference.poses

@@ -64,7 +64,7 @@ _NEEDED = ("states.npz", "metrics.json", "config.yaml")
 
 
 @dataclass(frozen=True)
-class Comparison:
+class TruthComparison:
     """Estimated poses of a run, and the true poses at the same instants."""
 
     matched: MatchedTrajectories
@@ -91,7 +91,7 @@ class RunRecord:
     """Columns of states.npz."""
     scans: dict[str, NDArray]
     """Columns of scans.npz; empty for a run that wrote none."""
-    comparison: Comparison | None = None
+    comparison: TruthComparison | None = None
     """Comparison with the truth; None where there is no truth."""
     remarks: list[str] = field(default_factory=list)
     """Sentences on what could not be read or compared."""
@@ -168,7 +168,7 @@ def read_run(folder: Path) -> RunRecord:
     return replace(run, comparison=_compared(folder / "truth.tum", run.trajectory, remarks))
 
 
-def _compared(path: Path, estimate: Trajectory, remarks: list[str]) -> Comparison | None:
+def _compared(path: Path, estimate: Trajectory, remarks: list[str]) -> TruthComparison | None:
     if not path.is_file():
         return None
     try:
@@ -176,4 +176,4 @@ def _compared(path: Path, estimate: Trajectory, remarks: list[str]) -> Compariso
     except LioJaxError as reason:
         remarks.append(f"The truth is not shown. {reason}")
         return None
-    return Comparison(matched, align(matched.estimate.poses, matched.reference.poses))
+    return TruthComparison(matched, align(matched.estimate.poses, matched.reference.poses))

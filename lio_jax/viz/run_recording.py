@@ -11,7 +11,7 @@ from lio_jax.run.failures import weak_directions
 from lio_jax.run.map_file import new_map_points
 from lio_jax.run.sinks import RunResult, Sink
 from lio_jax.run.track import ScanResult, pose_matrix
-from lio_jax.viz.recording import Recording
+from lio_jax.viz.recording import ViewerRecording
 from lio_jax.viz.run_record import read_correction
 
 _POINTS = 5000
@@ -20,7 +20,7 @@ _POINTS = 5000
 class RecordingSink(Sink):
     """Records every scan, thinned, and what the estimator knows after it."""
 
-    def __init__(self, recording: Recording, out: Path, truth: Trajectory | None = None) -> None:
+    def __init__(self, recording: ViewerRecording, out: Path, truth: Trajectory | None = None) -> None:
         """Record into an open recording, which is closed at the end of the run.
 
         Args:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.implicit import Problem, Solution, implicit, with_derivative_of
+from lio_jax.core.implicit import ImplicitSolution, Problem, implicit, with_derivative_of
 
 
 def solve(inputs):
@@ -22,7 +22,7 @@ def solve(inputs):
         newton,
         (jnp.ones_like(b), count),
     )
-    return Solution(x, steps, (a * x, steps))
+    return ImplicitSolution(x, steps, (a * x, steps))
 
 
 CUBIC = Problem(
@@ -68,7 +68,7 @@ def test_low_rank_directions_give_the_same_derivative():
 
     def solved(inputs):
         x = jnp.linalg.solve(jnp.eye(3) * 2 + 0.3 * jnp.ones((3, 3)), inputs)
-        return Solution(x, None, jnp.zeros(()))
+        return ImplicitSolution(x, None, jnp.zeros(()))
 
     def problem(directions):
         return Problem(
@@ -102,7 +102,7 @@ def test_a_structured_inverse_of_the_slope_gives_the_same_derivative_in_both_mod
         a, b = inputs
         step = lambda _, x: x - (x + a * jnp.tanh(x) - b) / (1 + a / jnp.cosh(x) ** 2)  # noqa: E731
         x = jax.lax.fori_loop(0, 30, step, b)
-        return Solution(x, None, jnp.sum(jnp.tanh(x)))
+        return ImplicitSolution(x, None, jnp.sum(jnp.tanh(x)))
 
     def problem(inverse_slope):
         return Problem(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lio_jax.loops.overlap import Agreement, conflict, fitness_of
+from lio_jax.loops.overlap import OverlapAgreement, conflict, fitness_of
 from tests.loops.places import pose
 
 
@@ -12,7 +12,7 @@ def test_distances_are_those_to_the_nearest_point_of_the_map():
     nearest = np.linalg.norm(source[:, None] - target, axis=2).min(axis=1)
     expected = np.where(nearest < 1.0, nearest, np.inf)
     assert 5 < np.sum(np.isfinite(expected)) < 50
-    found = Agreement(target).distances(source.astype(np.float64))
+    found = OverlapAgreement(target).distances(source.astype(np.float64))
     np.testing.assert_allclose(found, expected, atol=1e-6)
     assert np.isclose(fitness_of(found), np.mean(nearest[nearest < 1.0] ** 2))
     assert fitness_of(np.full(3, np.inf)) == np.inf

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.pose_graph.g2o import Edge, write_g2o
+from lio_jax.pose_graph.g2o import G2oEdge, write_g2o
 from tests.shared_data import SHARED_DATA, needs_shared
 
 
@@ -57,10 +57,12 @@ def read(text: str) -> tuple[dict, list]:
 
 
 @pytest.fixture
-def graph() -> tuple[np.ndarray, list[Edge]]:
+def graph() -> tuple[np.ndarray, list[G2oEdge]]:
     poses = np.stack([random_pose(seed) for seed in range(4)])
     pairs = [(0, 1), (1, 2), (2, 3), (0, 3)]
-    edges = [Edge(i, j, np.linalg.inv(poses[i]) @ poses[j], random_information(10 * i + j)) for i, j in pairs]
+    edges = [
+        G2oEdge(i, j, np.linalg.inv(poses[i]) @ poses[j], random_information(10 * i + j)) for i, j in pairs
+    ]
     return poses, edges
 
 
@@ -83,7 +85,7 @@ def test_what_was_written_is_read_back(tmp_path, graph):
 
 def test_translation_weights_come_first(tmp_path):
     information = np.diag([4.0, 5.0, 6.0, 1.0, 2.0, 3.0])
-    write_g2o(tmp_path / "graph.g2o", np.stack([np.eye(4)] * 2), [Edge(0, 1, np.eye(4), information)])
+    write_g2o(tmp_path / "graph.g2o", np.stack([np.eye(4)] * 2), [G2oEdge(0, 1, np.eye(4), information)])
     fields = (tmp_path / "graph.g2o").read_text().splitlines()[-1].split()
     upper = [float(f) for f in fields[10:]]
     diagonal = [upper[k] for k in (0, 6, 11, 15, 18, 20)]
@@ -127,7 +129,7 @@ def test_a_recorded_graph_survives(tmp_path):
     count = 100
     poses = np.stack([vertices[number] for number in range(count)])
     part = [
-        Edge(i, j, pose, information[np.ix_(swap, swap)])
+        G2oEdge(i, j, pose, information[np.ix_(swap, swap)])
         for i, j, pose, information in edges
         if max(i, j) < count
     ]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lio_jax.loops.place_descriptor import Places, polar_image
+from lio_jax.loops.place_descriptor import DescribedPlaces, polar_image
 from tests.loops.places import keyframe, pillars, pose, seen_from
 
 ANY = np.pi
@@ -12,7 +12,7 @@ REACH = 60.0
 
 def compared(others, newest, points, heading_error=ANY, poses=None):
     """Compare a place with others, each ``(T_odom_imu, cloud)``; poses as odometry has them if not given."""
-    places = Places(20, 60, REACH)
+    places = DescribedPlaces(20, 60, REACH)
     every = [*others, (newest, points)]
     for index, (T_odom_imu, cloud) in enumerate(every):
         places.add(keyframe(index, T_odom_imu, cloud))

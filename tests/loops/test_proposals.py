@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.leaf import numbers_of
-from lio_jax.loops.place_descriptor import Places
+from lio_jax.loops.place_descriptor import DescribedPlaces
 from lio_jax.loops.proposals import described_proposals, external_proposal, is_old, nearest_proposal
 from lio_jax.settings.shared import GlobalParams
 from tests.loops.places import keyframe, pillars, pose, seen_from
@@ -37,7 +37,7 @@ def test_nothing_is_proposed_beyond_the_radius_or_among_the_recent(old):
 
 def described(worlds, truth, newest, points, metres, twin=None):
     """Return the proposals of a keyframe after others that each saw a world of their own from its middle."""
-    places = Places(20, 60, 60.0)
+    places = DescribedPlaces(20, 60, 60.0)
     poses = [pose(*where) for where in truth]
     for index, (T, seed) in enumerate(zip(poses, worlds, strict=True)):
         shape = pillars(seed if twin != index else worlds[0])

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, LOST, NOT_FINITE, ImuBatch
-from lio_jax.run.failures import Evidence, failure_of, longest_gap, unobserved_directions
+from lio_jax.run.failures import ScanEvidence, failure_of, longest_gap, unobserved_directions
 from lio_jax.settings.settings import Settings, with_overrides
 
 SETTINGS = Settings()
@@ -46,8 +46,8 @@ def match(missing: tuple[np.ndarray, ...] = (), rotation: Rotation = UNTURNED, *
     return SimpleNamespace(**(values | fields))
 
 
-def evidence(**fields) -> Evidence:
-    usual = Evidence(
+def evidence(**fields) -> ScanEvidence:
+    usual = ScanEvidence(
         points=1000,
         nav=nav(),
         registration=match(),
@@ -59,7 +59,7 @@ def evidence(**fields) -> Evidence:
     return replace(usual, **fields)
 
 
-def said(before: Evidence | None = None, settings: Settings = SETTINGS, **fields) -> str:
+def said(before: ScanEvidence | None = None, settings: Settings = SETTINGS, **fields) -> str:
     return failure_of(evidence(**fields), before or evidence(), settings)
 
 

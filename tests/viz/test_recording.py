@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.viz import recording as recording_module
-from lio_jax.viz.recording import BYTES_PER_POINT, Recording
+from lio_jax.viz.recording import BYTES_PER_POINT, ViewerRecording
 
 TURN = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
 SIGMA = TURN @ np.diag([0.01, 0.02, 0.05]) ** 2 @ TURN.T
@@ -28,7 +28,7 @@ def write(path, scans: int, points: int = 20_000):
     generator = np.random.default_rng(0)
     cloud = generator.normal(scale=20.0, size=(points, 3)).astype(np.float32)
     corners = np.arange(points) < points // 4
-    with Recording(path, scan_count=scans) as recording:
+    with ViewerRecording(path, scan_count=scans) as recording:
         recording.log_truth(np.array([pose(index)[:3, 3] for index in range(scans)]))
         for index in range(scans):
             stamp_ns = EPOCH_NS + index * PERIOD_NS
@@ -195,7 +195,7 @@ def _entities(path) -> set[str]:
 
 def test_long_recordings_get_fewer_points_a_scan(tmp_path):
     cloud = np.zeros((20_000, 3), np.float32)
-    with Recording(tmp_path / "long.rrd", scan_count=5_000) as recording:
+    with ViewerRecording(tmp_path / "long.rrd", scan_count=5_000) as recording:
         recording.log_scan(0, 0, cloud, np.eye(4))
     first = next(
         row for row in rows(tmp_path / "long.rrd", "/world/lidar/scan") if "Points3D:positions" in row
@@ -205,7 +205,7 @@ def test_long_recordings_get_fewer_points_a_scan(tmp_path):
 
 def test_strips_stay_linear_in_the_length_of_the_run(tmp_path):
     point = np.zeros((1, 3), np.float32)
-    with Recording(tmp_path / "long.rrd") as recording:
+    with ViewerRecording(tmp_path / "long.rrd") as recording:
         for index in range(2_000):
             recording.log_scan(index, index, point, np.eye(4))
     lengths = [len(row["LineStrips3D:strips"][0]) for row in rows(tmp_path / "long.rrd", "/world/trajectory")]
@@ -214,14 +214,14 @@ def test_strips_stay_linear_in_the_length_of_the_run(tmp_path):
 
 
 def test_empty_scan_and_empty_map_are_recorded(tmp_path):
-    with Recording(tmp_path / "empty.rrd") as recording:
+    with ViewerRecording(tmp_path / "empty.rrd") as recording:
         recording.log_scan(0, 0, np.zeros((0, 3), np.float32), np.eye(4))
         recording.log_added(0, 0, np.zeros((0, 3), np.float32))
     assert len(rows(tmp_path / "empty.rrd", "/world/lidar")) == 1
 
 
 def test_pose_that_is_not_finite_is_left_out(tmp_path):
-    with Recording(tmp_path / "diverged.rrd") as recording:
+    with ViewerRecording(tmp_path / "diverged.rrd") as recording:
         recording.log_scan(0, 0, np.zeros((1, 3), np.float32), np.eye(4))
         recording.log_scan(1, 1, np.zeros((1, 3), np.float32), np.full((4, 4), np.nan))
     assert [row["scan"] for row in rows(tmp_path / "diverged.rrd", "/world/lidar")] == [0]
@@ -229,7 +229,7 @@ def test_pose_that_is_not_finite_is_left_out(tmp_path):
 
 def test_nothing_is_left_when_the_run_fails(tmp_path):
     def run():
-        with Recording(tmp_path / "failed.rrd") as recording:
+        with ViewerRecording(tmp_path / "failed.rrd") as recording:
             recording.log_scan(0, 0, np.zeros((1, 3), np.float32), np.eye(4))
             raise ZeroDivisionError
 
@@ -240,7 +240,7 @@ def test_nothing_is_left_when_the_run_fails(tmp_path):
 
 def test_file_has_its_name_only_when_it_is_whole(tmp_path):
     path = tmp_path / "recording.rrd"
-    recording = Recording(path)
+    recording = ViewerRecording(path)
     recording.log_scan(0, 0, np.zeros((1, 3), np.float32), np.eye(4))
     assert not path.exists()
     recording.close()
@@ -250,11 +250,11 @@ def test_file_has_its_name_only_when_it_is_whole(tmp_path):
 
 def test_folder_that_does_not_exist_is_an_error(tmp_path):
     with pytest.raises(LioJaxError, match=r"nowhere/recording\.rrd"):
-        Recording(tmp_path / "nowhere" / "recording.rrd")
+        ViewerRecording(tmp_path / "nowhere" / "recording.rrd")
 
 
 def test_logging_after_close_is_an_error(tmp_path):
-    recording = Recording(tmp_path / "closed.rrd")
+    recording = ViewerRecording(tmp_path / "closed.rrd")
     recording.close()
     with pytest.raises(LioJaxError, match=r"closed\.rrd: the recording is closed"):
         recording.log_metrics(0, 0, {"scan_ms": 1.0})
@@ -263,7 +263,7 @@ def test_logging_after_close_is_an_error(tmp_path):
 def test_a_scan_costs_little(tmp_path):
     cloud = np.random.default_rng(0).normal(size=(10_000, 3)).astype(np.float32)
     milliseconds = []
-    with Recording(tmp_path / "timed.rrd") as recording:
+    with ViewerRecording(tmp_path / "timed.rrd") as recording:
         for index in range(100):
             started = time.perf_counter()
             recording.log_scan(index, index, cloud, np.eye(4))

@@ -17,13 +17,13 @@ import pytest
 from lio_jax.cli import main
 from lio_jax.core.errors import LioJaxError
 from lio_jax.viz import viewer
-from lio_jax.viz.recording import Recording
+from lio_jax.viz.recording import ViewerRecording
 from lio_jax.viz.viewer import served
 from tests.viz.browser import needs_browser, seen
 
 
 def short(path: Path, live: str | None = None) -> Path:
-    with Recording(path, scan_count=2, live=live) as recording:
+    with ViewerRecording(path, scan_count=2, live=live) as recording:
         for index in range(2):
             recording.log_scan(index, index, np.ones((10, 3), np.float32), np.eye(4))
     return path
@@ -73,7 +73,7 @@ def test_a_browser_draws_the_world(tmp_path, pictures):
     fence = np.zeros((400, 2, 3))
     fence[:, :, 1] = np.linspace(-6, 6, 400)[:, None]
     fence[:, :, 2] = [-4, 4]
-    with Recording(tmp_path / "recording.rrd", scan_count=2) as recording:
+    with ViewerRecording(tmp_path / "recording.rrd", scan_count=2) as recording:
         for index in range(2):
             recording.log_scan(index, index, fence[:, 0].astype(np.float32), np.eye(4))
             recording.log_correction(
