@@ -12,6 +12,8 @@ import time
 from html.parser import HTMLParser
 from pathlib import Path
 
+import pytest
+
 from lio_jax.ablation import cluster
 from lio_jax.core.files import folder_lock
 from tests.ablation.drives import DRIVE, write_spec

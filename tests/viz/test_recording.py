@@ -290,8 +290,8 @@ def test_neither_prints_nor_talks_nor_touches_home(tmp_path):
     code = NETWORK_SOCKETS + (
         "import sys\n"
         "import numpy as np\n"
-        "from lio_jax.viz.recording import Recording\n"
-        "with Recording(Path(sys.argv[1])) as recording:\n"
+        "from lio_jax.viz.recording import ViewerRecording\n"
+        "with ViewerRecording(Path(sys.argv[1])) as recording:\n"
         "    recording.log_scan(0, 0, np.zeros((9, 3), np.float32), np.eye(4))\n"
         "    assert not network_sockets()\n"
         "import rerun\n"
