@@ -1,5 +1,6 @@
 """Choose the reader of a recording by the layout of its path."""
 
+from dataclasses import fields
 from pathlib import Path
 
 from lio_jax.core.errors import LioJaxError
@@ -10,6 +11,8 @@ from lio_jax.data.sequence import Reader, Sequence, entries
 READERS = (kitti.READER, kitti_raw.READER, native.READER, rosbag.READER)
 """All readers; the first one that recognises a path opens it. A new format is a module and an entry here."""
 
+_BY_THE_RUN = {"prefetch"}
+"""Fields that a run reads itself, whatever the format."""
 _SEARCH_DEPTH = 3
 _NAMED_AT_MOST = 12
 
@@ -33,6 +36,20 @@ def open_sequence(path: Path | str, config: DataConfig | None = None) -> Sequenc
     if reader is None:
         raise LioJaxError(_unknown(path))
     return reader.open(path, config)
+
+
+def without_effect(format_name: str, config: DataConfig) -> list[str]:
+    """Return the fields of ``config`` that differ from their defaults and that a format's reader never reads.
+
+    Args:
+        format_name: ``SequenceInfo.format``; the result is empty for one that no reader has.
+        config: how the recording is read.
+    """
+    reads = next((reader.reads for reader in READERS if reader.name == format_name), None)
+    if reads is None:
+        return []
+    unread = [field for field in fields(config) if field.name not in reads | _BY_THE_RUN]
+    return [field.name for field in unread if getattr(config, field.name) != field.default]
 
 
 def _reader_of(path: Path) -> Reader | None:

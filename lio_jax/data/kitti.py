@@ -213,4 +213,5 @@ READER = Reader(
     "a KITTI odometry sequence (velodyne/*.bin)",
     lambda path: (path / "velodyne").is_dir(),
     KittiSequence,
+    reads=frozenset({"compensated", "scan_period", "vertical_correction_deg"}),
 )

@@ -31,6 +31,8 @@ _ROLL_PITCH_YAW = slice(3, 6)
 _ACCEL = slice(11, 14)
 _GYRO = slice(17, 20)
 _POSITION_SIGMA = 23
+NO_STAMP = np.iinfo(np.int64).min
+"""Stands for an empty line among timestamps; it is NumPy's "not a time"."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +73,10 @@ class OxtsPackets:
 def read_timestamps(path: Path) -> NDArray[np.int64]:
     """Read lines ``YYYY-MM-DD HH:MM:SS.nnnnnnnnn`` (UTC) with full precision, (n,) ns.
 
+    An empty line gives ``NO_STAMP``: some of the public drives have one where the recording lost a scan.
+
     Raises:
-        LioJaxError: the file is missing or a line is not a date and time.
+        LioJaxError: the file is missing, or another line is not a date and time.
     """
     if not path.is_file():
         raise LioJaxError(f"{path}: missing; copy the drive's folder completely.")
@@ -83,8 +87,6 @@ def read_timestamps(path: Path) -> NDArray[np.int64]:
         stamps = np.array([], "datetime64[ns]")
         for number, line in enumerate(lines, 1):
             _check_timestamp(path, number, line)
-    if np.isnat(stamps).any():
-        _check_timestamp(path, int(np.argmax(np.isnat(stamps))) + 1, "")
     return stamps.astype(np.int64)
 
 
@@ -104,7 +106,7 @@ def read_oxts(folder: Path, warn: Callable[[str], None]) -> OxtsPackets | None:
     rows: list[NDArray[np.float64]] = []
     broken: list[str] = []
     for number, path in files.items():
-        row = _packet(path) if number < len(all_stamps) else None
+        row = _packet(path) if _has_stamp(all_stamps, number) else None
         if row is None:
             broken.append(path.name)
         else:
@@ -131,12 +133,15 @@ def _packet(path: Path) -> NDArray[np.float64] | None:
 
 def _check_timestamp(path: Path, number: int, line: str) -> None:
     try:
-        if line.strip():
-            np.datetime64(line.strip(), "ns")
-            return
+        np.datetime64(line.strip(), "ns")
     except ValueError:
-        pass
-    raise LioJaxError(f"{path}: line {number} ('{line[:40]}') is not 'YYYY-MM-DD HH:MM:SS.fraction'; fix it.")
+        raise LioJaxError(
+            f"{path}: line {number} ('{line[:40]}') is not 'YYYY-MM-DD HH:MM:SS.fraction'; fix it."
+        ) from None
+
+
+def _has_stamp(stamps: NDArray[np.int64], number: int) -> bool:
+    return number < len(stamps) and stamps[number] != NO_STAMP
 
 
 _LONGEST_SWEEP_S = 0.5
@@ -235,6 +240,10 @@ class KittiRawSequence:
             self._notes.append(f"a cut-out: {len(starts)} timestamps, the scans end at {files[last].name}")
         if missing := missing_numbers(files):
             self._log.add(f"{velodyne / 'data'}: scan(s) {listed(missing, 10)} are missing and were skipped.")
+        if unstamped := [n for n in files if n < len(starts) and not _has_stamp(starts, n)]:
+            self._log.add(
+                f"{velodyne}: the timestamps of scan(s) {listed(unstamped, 10)} are empty; they were skipped."
+            )
         if untimed := [number for number in files if number >= len(starts)]:
             self._log.add(
                 f"{velodyne}: the timestamps end before scan(s) {listed(untimed, 10)}; they were skipped."
@@ -243,7 +252,7 @@ class KittiRawSequence:
         timed = (
             Stamped(int(starts[number]), str(path), (number, path))
             for number, path in files.items()
-            if number < len(starts)
+            if _has_stamp(starts, number)
         )
         sweeps = []
         for number, path in in_time_order(timed, self._log.add):
@@ -263,14 +272,15 @@ class KittiRawSequence:
         if (velodyne / "timestamps_start.txt").is_file():
             starts = read_timestamps(velodyne / "timestamps_start.txt")
         else:
-            starts = read_timestamps(velodyne / "timestamps.txt") - period_ns // 2
+            middles = read_timestamps(velodyne / "timestamps.txt")
+            starts = np.where(middles == NO_STAMP, NO_STAMP, middles - period_ns // 2)
             self._notes.append(
                 "no timestamps_start.txt: sweeps start half a scan_period before timestamps.txt"
             )
         ends = starts + period_ns
         if (velodyne / "timestamps_end.txt").is_file():
             known = read_timestamps(velodyne / "timestamps_end.txt")[: len(starts)]
-            ends[: len(known)] = known
+            ends[: len(known)] = np.where(known == NO_STAMP, ends[: len(known)], known)
         else:
             self._notes.append(
                 f"no timestamps_end.txt: sweeps are taken to last {self._config.scan_period} s"
@@ -297,4 +307,5 @@ READER = Reader(
     "a KITTI raw drive (velodyne_points/data)",
     lambda path: (path / "velodyne_points").is_dir(),
     KittiRawSequence,
+    reads=frozenset({"compensated", "scan_period"}),
 )

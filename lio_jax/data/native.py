@@ -167,4 +167,5 @@ READER = Reader(
     "a native folder (meta.yaml and scans/)",
     lambda path: (path / "meta.yaml").is_file(),
     NativeSequence,
+    reads=frozenset({"compensated"}),
 )

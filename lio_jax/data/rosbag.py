@@ -327,5 +327,20 @@ READER = Reader(
     "a ROS 2 bag folder (metadata.yaml) or a bag file (.bag, .db3, .mcap)",
     _is_bag,
     RosbagSequence,
+    reads=frozenset(
+        [
+            "lidar_topic",
+            "imu_topic",
+            "gps_topic",
+            "time_field",
+            "time_unit",
+            "time_reference",
+            "stamp_at",
+            "accel_unit",
+            "compensated",
+            "beams",
+            "scan_period",
+        ]
+    ),
     has_parts=False,
 )

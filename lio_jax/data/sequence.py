@@ -209,6 +209,8 @@ class Reader:
     """Whether an existing path looks like such a recording."""
     open: Callable[[Path, DataConfig], Sequence]
     """Opens it; raises LioJaxError where it is broken."""
+    reads: frozenset[str]
+    """The fields of DataConfig that change what is read."""
     has_parts: bool = True
     """Whether the paths inside such a recording are parts of it and no recordings themselves."""
 

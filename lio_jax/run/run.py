@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lio_jax.core.errors import LioJaxError, UsageError
+from lio_jax.data.detect import without_effect
 from lio_jax.data.imu_checks import cleaned
 from lio_jax.data.sequence import LidarScan, Sequence, prefetched
 from lio_jax.imu.params import OrientedImuConfig
@@ -31,7 +32,11 @@ def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list
     settings, calibration = _calibrated(sequence, settings)
     settings, fitted = fitted_to_surroundings(sequence, settings)
     settings, sizes = with_sensor_sizes(settings, sequence.scans())
-    return settings, [calibration, *fitted, *sizes]
+    unused = [
+        f"config.data.{name} has no effect on a recording of the format {sequence.info.format}; leave it out."
+        for name in without_effect(sequence.info.format, settings.run.data)
+    ]
+    return settings, [calibration, *fitted, *sizes, *unused]
 
 
 def _calibrated(sequence: Sequence, settings: Settings) -> tuple[Settings, str]:

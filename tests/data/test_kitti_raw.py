@@ -117,6 +117,51 @@ def test_missing_scans_in_the_middle_are_named_and_at_the_end_noted(tmp_path: Pa
     assert any("8 timestamps" in note for note in sequence.info.notes)
 
 
+@pytest.mark.parametrize("stamped", ["start and end", "middle alone"])
+def test_empty_lines_where_scans_were_lost(tmp_path: Path, stamped: str) -> None:
+    """Public drives have an empty line in each file of stamps, and no file, where the recording lost a
+    scan."""
+    folder = write_drive(tmp_path, 8)
+    velodyne = folder / "velodyne_points"
+    for path in velodyne.glob("timestamps*.txt"):
+        lines = path.read_text().splitlines()
+        lines[2] = lines[3] = lines[5] = ""
+        path.write_text("\n".join(lines) + "\n")
+    if stamped == "middle alone":
+        (velodyne / "timestamps_start.txt").unlink()
+        (velodyne / "timestamps_end.txt").unlink()
+    for number in (2, 3):
+        (velodyne / "data" / f"{number:010d}.bin").unlink()
+    sequence = opened(folder)
+    found = list(sequence.scans())
+    assert [round((scan.stamp_ns - SECOND * 10**9) * 1e-8) for scan in found] == [0, 1, 4, 6, 7]
+    assert all(0.09 < scan.duration < 0.11 for scan in found)
+    missing, empty = sequence.warnings_so_far
+    assert "0000000002-0000000003 are missing" in missing
+    assert "scan(s) 0000000005 are empty" in empty
+
+
+def test_a_sweep_without_an_end_stamp_lasts_a_scan_period(tmp_path: Path) -> None:
+    folder = write_drive(tmp_path, 3)
+    ends = folder / "velodyne_points" / "timestamps_end.txt"
+    first, _, last = ends.read_text().splitlines()
+    ends.write_text(f"{first}\n\n{last}\n")
+    assert [round(scan.duration, 6) for scan in opened(folder).scans()] == [0.098, 0.1, 0.098]
+
+
+def test_packets_without_a_stamp_are_left_out(tmp_path: Path) -> None:
+    folder = write_drive(tmp_path, 4)
+    path = folder / "oxts" / "timestamps.txt"
+    lines = path.read_text().splitlines()
+    lines[1] = ""
+    path.write_text("\n".join(lines) + "\n")
+    sequence = opened(folder)
+    assert len(sequence.imu().stamp_ns) == 3
+    assert (
+        "1 packet(s) unreadable or without timestamp, left out: 0000000001.txt" in sequence.warnings_so_far[0]
+    )
+
+
 def test_duplicate_and_backward_stamps_are_left_out_and_named(tmp_path: Path) -> None:
     folder = write_drive(tmp_path, 5)
     (folder / "velodyne_points" / "timestamps_start.txt").write_text(stamps(0.0, 0.1, 0.1, 0.02, 0.4))

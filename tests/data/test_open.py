@@ -1,4 +1,6 @@
+from dataclasses import fields
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -7,7 +9,11 @@ from lio_jax.core.errors import LioJaxError
 from lio_jax.data import detect, native, open_sequence, write_native
 from lio_jax.data.config import DataConfig
 from lio_jax.data.sequence import Reader
+from tests.data import bags
+from tests.data.test_kitti import write_sequence
+from tests.data.test_kitti_raw import write_drive
 from tests.data.test_native import scans
+from tests.run.small_drive import bag_messages, moving
 from tests.shared_data import SHARED_DATA, needs_shared
 
 
@@ -29,6 +35,48 @@ def test_real_recordings_find_their_reader(path: str, kind: str) -> None:
     assert np.isfinite(scan.points).all()
 
 
+class Spied(DataConfig):
+    """A config that knows which of its fields were read."""
+
+    read: ClassVar[set[str]] = set()
+
+    def __getattribute__(self, name: str) -> object:
+        Spied.read.add(name)
+        return super().__getattribute__(name)
+
+
+def _own(kind: str, folder: Path) -> Path:
+    if kind == "native":
+        write_native(folder / "s", scans(2))
+        return folder / "s"
+    if kind == "kitti_raw":
+        return write_drive(folder)
+    if kind == "kitti_odometry":
+        return write_sequence(folder)
+    return bags.write_bag(folder / "a.bag", bag_messages(moving()[:2], ros2=False))
+
+
+@pytest.mark.parametrize("reader", detect.READERS, ids=lambda reader: reader.name)
+def test_readers_read_the_fields_that_they_name(tmp_path: Path, reader: Reader) -> None:
+    Spied.read.clear()
+    sequence = open_sequence(_own(reader.name, tmp_path), Spied())
+    assert sequence.info.format == reader.name
+    list(sequence.scans())
+    sequence.imu()
+    sequence.gps()
+    names = {field.name for field in fields(DataConfig)}
+    assert reader.reads <= names
+    assert Spied.read & names <= reader.reads
+
+
+def test_fields_without_effect_are_named() -> None:
+    config = DataConfig(vertical_correction_deg=0.0, beams=16, prefetch=9)
+    assert detect.without_effect("kitti_odometry", config) == ["beams"]
+    assert detect.without_effect("native", config) == ["vertical_correction_deg", "beams"]
+    assert detect.without_effect("rosbag", config) == ["vertical_correction_deg"]
+    assert detect.without_effect("memory", config) == []
+
+
 def test_a_native_folder_finds_its_reader(tmp_path: Path) -> None:
     write_native(tmp_path / "s", scans(1))
     assert open_sequence(str(tmp_path / "s")).info.format == "native"
@@ -43,7 +91,13 @@ def test_a_new_reader_is_one_entry(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     recording = tmp_path / "all" / "recording"
     write_native(recording, scans(1))
     (recording / "meta.yaml").rename(recording / "other.yaml")
-    reader = Reader("other", "another folder (other.yaml)", lambda p: (p / "other.yaml").is_file(), _renamed)
+    reader = Reader(
+        "other",
+        "another folder (other.yaml)",
+        lambda p: (p / "other.yaml").is_file(),
+        _renamed,
+        reads=frozenset({"compensated"}),
+    )
     with pytest.raises(LioJaxError, match="the layout is not known"):
         open_sequence(recording)
     monkeypatch.setattr(detect, "READERS", (*detect.READERS, reader))
