@@ -59,7 +59,6 @@ def run_sequence(
     start: int = 0,
     count: int | None = None,
     sinks: Listing[Sink] = (),
-    step: CompiledStep | None = None,
 ) -> RunResult:
     """Estimate the recording's trajectory and map, and write the run folder's files.
 
@@ -74,7 +73,6 @@ def run_sequence(
         sinks: your own, derived from :class:`lio_jax.Sink`: each takes every scan's result after the run's
             own sinks, and finishes after them, when their files are written. What it raises in ``take`` ends
             the run early; what it raises in ``finish`` costs its own results alone.
-        step: a compiled step of the same settings, to reuse its programs.
 
     Raises:
         UsageError: the recording ends before ``start``.
@@ -86,7 +84,7 @@ def run_sequence(
         check_start(sequence, start)
         out.mkdir(parents=True, exist_ok=True)
         began = time.perf_counter()
-        step = step or CompiledStep(settings)
+        step = CompiledStep(settings)
         imu, imu_notes = imu_feed(sequence, settings)
         log, times = TrajectoryLog(), StageTimes("decode", "pad", "step", "record", "total")
         # the log last: wherever Ctrl-C comes, the others have every scan that it has
