@@ -26,6 +26,8 @@ class Rule:
     """Function that converts the key's value."""
     method: bool = False
     """Whether the key belongs to the system's own method, not to the sensors."""
+    paths: tuple[str, ...] = ()
+    """Settings that always take the key's value, converted or not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +48,12 @@ class System:
 
 def same(*paths: str, word: str = "", method: bool = False) -> Rule:
     """Return the rule of a key that has the same meaning here, under the names ``paths``."""
-    return Rule(lambda value, place, values: (dict.fromkeys(paths, value), word), method)
+    return Rule(lambda value, place, values: (dict.fromkeys(paths, value), word), method, paths)
 
 
 def converted(*paths: str, by: Callable[[Any, str], Any], word: str, method: bool = False) -> Rule:
     """Return the rule of a key whose value is converted by ``by(value, place)``."""
-    return Rule(lambda value, place, values: (dict.fromkeys(paths, by(value, place)), word), method)
+    return Rule(lambda value, place, values: (dict.fromkeys(paths, by(value, place)), word), method, paths)
 
 
 def nothing(why: str) -> Rule:

@@ -14,6 +14,7 @@ from lio_jax.core.files import atomic_path
 from lio_jax.core.leaf import Setting, choices
 from lio_jax.recipes import RECIPES
 from lio_jax.settings.settings import declared_settings, recipe_settings
+from lio_jax.settings.translate import SYSTEMS
 
 _WIDTH = 110
 _HEADER = "| key | unit | default | tuned | meaning |"
@@ -21,7 +22,17 @@ _TUNED = {"log": "by its logarithm", "linear": "as it is", "turn": "as a rotatio
 
 
 def recipe_file(recipe: str) -> str:
-    """Return the text of a recipe's settings file: every value, with unit and meaning as comments."""
+    """Return the text of a recipe's settings file.
+
+    Comments give every value's meaning, its unit, and its name in the program that the recipe follows.
+    """
+    original = {
+        path: f" {system.name}: {key}."
+        for system in SYSTEMS
+        if system.recipe == recipe
+        for key, rule in system.rules.items()
+        for path in rule.paths
+    }
     lines = [
         f"# Every setting of the recipe {recipe}, with its default. Copy the file, keep the lines that you",
         "# change, and give it to --recipe. Generated from the declarations in the code by 'make settings';",
@@ -35,10 +46,11 @@ def recipe_file(recipe: str) -> str:
         for section, values in tree[kind].items():
             lines.append(f"  {section}:")
             for name, value in values.items():
-                setting = declared[f"{kind}.{section}.{name}"]
+                setting_path = f"{kind}.{section}.{name}"
+                setting = declared[setting_path]
                 unit = f" [{setting.declared.unit}]" if setting.declared.unit else ""
                 lines += textwrap.wrap(
-                    f"{_first_sentence(setting.doc)}{unit}",
+                    f"{_first_sentence(setting.doc)}{unit}{original.get(setting_path, '')}",
                     _WIDTH,
                     initial_indent="    # ",
                     subsequent_indent="    # ",
