@@ -1,7 +1,6 @@
 """PointCloud2 layouts against the sweep they were written from, and against a byte-by-byte reader."""
 
 import struct
-import time
 
 import numpy as np
 import pytest
@@ -72,14 +71,6 @@ def test_a_real_ouster_message_equals_a_byte_by_byte_reading() -> None:
             assert (cloud.ring[kept],) == struct.unpack_from("B", data, 48 * number + 26)
         kept += 1
     assert len(cloud.points) == kept
-
-    def decode_ms(raw: bytes) -> float:
-        begin = time.perf_counter()
-        decode_pointcloud2(types.deserialize_ros1(raw, bags.CLOUD))
-        return (time.perf_counter() - begin) * 1e3
-
-    # The figure to hold is 8 ms; the best of several runs is what a busy machine cannot spoil.
-    assert min(decode_ms(raw) for raw in raws * 4) < 8.0
 
 
 def test_nan_infinite_and_zero_points_are_dropped_together_with_their_fields() -> None:

@@ -1,5 +1,4 @@
 import itertools
-import time
 
 import numpy as np
 import pytest
@@ -37,12 +36,9 @@ def devkit(estimate, reference, lengths, step):
 def test_reproduces_the_printed_numbers_of_kitti_00():
     estimate = read_kitti_poses(KISS_ICP_00 / "00_poses_kitti.txt")
     reference = read_kitti_poses(KISS_ICP_00 / "00_gt_kitti.txt")
-    started = time.perf_counter()
     errors = kitti_errors(estimate, reference)
-    elapsed = time.perf_counter() - started
     assert f"{errors.translation_percent:.3f}" == "0.527"
     assert f"{errors.rotation_deg_per_m:.3f}" == "0.002"
-    assert elapsed < 2.0
 
 
 @needs_shared
