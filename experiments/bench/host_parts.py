@@ -41,9 +41,15 @@ def cloud_message() -> SimpleNamespace:
     points[:, :12] = random.normal(0, 20, (POINTS, 3)).astype("<f4").view(np.uint8)
     points[:, 20:24] = np.linspace(0, 1e8, POINTS).astype("<u4")[:, None].view(np.uint8)
     fields = [SimpleNamespace(name=n, offset=at, datatype=kinds[n], count=1) for n, at in layout.items()]
-    size = SimpleNamespace(height=128, width=POINTS // 128, point_step=48, row_step=48 * POINTS // 128)
     return SimpleNamespace(
-        **vars(size), fields=fields, data=points.ravel(), is_bigendian=False, is_dense=True
+        header=SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="lidar"),
+        height=128,
+        width=POINTS // 128,
+        point_step=48,
+        row_step=48 * POINTS // 128,
+        fields=fields,
+        data=points.ravel(),
+        is_bigendian=False,
     )
 
 
