@@ -1,4 +1,4 @@
-"""Write files atomically: under a temporary name in the same folder, then renamed."""
+"""Read .npz files safely; write files atomically: under a temporary name in the same folder, then renamed."""
 
 import fcntl
 import os

@@ -63,8 +63,7 @@ class _Pairs(NamedTuple):
 
     def residual(self, yaw: float, shift: _Array) -> _Array:
         """Return (k, 3) whitened residuals L' (Rz(yaw) p + t - f)."""
-        missed = self.odometry @ _about_z(yaw).T + shift - self.fix
-        return np.asarray(np.einsum("kji,kj->ki", self.root, missed))
+        return np.asarray(_whitened(np, np.array([yaw, *shift]), self.odometry, self.fix, self.root))
 
     def slope(self, yaw: float) -> _Array:
         """Return the (k, 3, 4) derivatives of the whitened residuals by yaw and t."""
@@ -156,16 +155,22 @@ def _refined(start: jax.Array, odometry: jax.Array, fix: jax.Array, root: jax.Ar
     """Return the yaw and translation (4,) that minimise the sum of squares of root' (Rz(yaw) p + t - f)."""
     import optimistix as optx  # takes 0.3 s, and only recordings with fixes need it
 
-    def misfit(x: jax.Array, _: None) -> jax.Array:
-        cosine, sine = jnp.cos(x[0]), jnp.sin(x[0])
-        east = cosine * odometry[:, 0] - sine * odometry[:, 1]
-        north = sine * odometry[:, 0] + cosine * odometry[:, 1]
-        missed = jnp.stack([east, north, odometry[:, 2]], axis=-1) + x[1:] - fix
-        return jnp.einsum("kji,kj->ki", root, missed)
-
     return optx.least_squares(
-        misfit, optx.LevenbergMarquardt(_PRECISION, _PRECISION), start, max_steps=_STEPS, throw=False
+        lambda x, _: _whitened(jnp, x, odometry, fix, root),
+        optx.LevenbergMarquardt(_PRECISION, _PRECISION),
+        start,
+        max_steps=_STEPS,
+        throw=False,
     ).value
+
+
+def _whitened(xp: Any, x: Any, odometry: Any, fix: Any, root: Any) -> Any:
+    """Return (k, 3) residuals root' (Rz(x[0]) p + x[1:] - f); ``xp`` is numpy, or jax.numpy in a program."""
+    cosine, sine = xp.cos(x[0]), xp.sin(x[0])
+    east = cosine * odometry[:, 0] - sine * odometry[:, 1]
+    north = sine * odometry[:, 0] + cosine * odometry[:, 1]
+    missed = xp.stack([east, north, odometry[:, 2]], axis=-1) + x[1:] - fix
+    return xp.einsum("kji,kj->ki", root, missed)
 
 
 def _covariance(pairs: _Pairs, inlier: NDArray[np.bool_], yaw: float, shift: _Array) -> _Array | None:

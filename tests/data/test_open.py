@@ -56,10 +56,11 @@ def _own(kind: str, folder: Path) -> Path:
     return bags.write_bag(folder / "a.bag", bag_messages(moving()[:2], ros2=False))
 
 
+@pytest.mark.parametrize("compensated", ["auto", "no"])
 @pytest.mark.parametrize("reader", detect.READERS, ids=lambda reader: reader.name)
-def test_readers_read_the_fields_that_they_name(tmp_path: Path, reader: Reader) -> None:
+def test_readers_read_the_fields_that_they_name(tmp_path: Path, reader: Reader, compensated: str) -> None:
     Spied.read.clear()
-    sequence = open_sequence(_own(reader.name, tmp_path), Spied())
+    sequence = open_sequence(_own(reader.name, tmp_path), Spied(compensated=compensated))
     assert sequence.info.format == reader.name
     list(sequence.scans())
     sequence.imu()
