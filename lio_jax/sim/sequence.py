@@ -24,7 +24,7 @@ from lio_jax.sim.lidar import Lidar, Sweep, column_times, firing_times_ns, spinn
 from lio_jax.sim.sensors import Layout, RosetteLidar, find_sensor
 from lio_jax.sim.trajectory import Motion, motion_along, motion_through, pose_at
 from lio_jax.sim.world_registry import build
-from lio_jax.sim.worlds import Counts, Part, World, counts_along, nearest_part
+from lio_jax.sim.worlds import Counts, Part, Scene, World, counts_along, nearest_part
 
 EPOCH_NS = 1_700_000_000_000_000_000
 """Absolute time of the recording's start, ns."""
@@ -45,7 +45,7 @@ class SimulatedSequence:
 
     def __init__(
         self,
-        world: str = "street",
+        world: str | Scene = "street",
         sensor: str | Lidar = "generic32",
         duration_s: float | None = None,
         seed: int = 0,
@@ -62,7 +62,7 @@ class SimulatedSequence:
         """Build the world and check that the motion is free; no scan is ray cast yet.
 
         Args:
-            world: a name of ``world_registry.WORLDS``.
+            world: a name of ``world_registry.WORLDS``, or a scene of your own.
             sensor: a name of ``sensors.SENSORS``, or a sensor.
             duration_s: length of the recording, s, in whole sweeps. None: the whole ``trajectory``, or 10 s.
             seed: seed of world, motion and noise.
@@ -79,7 +79,8 @@ class SimulatedSequence:
             UsageError: an unknown world or sensor, an impossible duration or extrinsic, or a motion that
                 meets a surface.
         """
-        scene = build(world, seed)
+        scene = build(world, seed) if isinstance(world, str) else world
+        name = world if isinstance(world, str) else "own"
         self.lidar, self.lidar_layout, description = _sensor(sensor, beams, columns)
         if duration_s is None:
             duration_s = _span(trajectory) if trajectory is not None else _DURATION
@@ -113,13 +114,13 @@ class SimulatedSequence:
         self._noise_key = jax.random.fold_in(jax.random.key(seed), 1)
         sigma = float(self.lidar.ranging.sigma)
         self.info = SequenceInfo(
-            name=f"{world}_{seed}",
+            name=f"{name}_{seed}",
             format="simulated",
             path="",
             scan_count=int(duration_s / self.lidar.period + 1e-6),
             T_imu_lidar=extrinsic,
             sensor=f"simulated, {description}",
-            notes=(f"{world} world, seed {seed}: ray cast, range noise {sigma:g} m.",),
+            notes=(f"{name} world, seed {seed}: ray cast, range noise {sigma:g} m.",),
         )
         times = np.arange(0.0, self.duration_s, STEP)
         positions = self.poses(times)[:, :3, 3]
