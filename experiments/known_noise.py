@@ -128,8 +128,7 @@ class Workshop:
     def judged(self, x: np.ndarray | None, world: str, seed: int) -> Judged:
         """Run with the parameters of ``x``, or with the shipped ones for None, and compare with the truth."""
         from lio_jax.core.error_state import local
-        from lio_jax.evaluation.consistency import nees
-        from lio_jax.evaluation.trajectory_error import align, position_errors
+        from lio_jax.evaluation.trajectory_error import align, nees, position_errors
         from lio_jax.run.track import CompiledStep, run_steps
 
         recording, sequence = self.recording(world, seed)

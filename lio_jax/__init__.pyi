@@ -10,11 +10,9 @@ from .data import LidarScan as LidarScan
 from .data import Sequence as Sequence
 from .data import Trajectory as Trajectory
 from .data import open_sequence as open_sequence
-from .evaluation.consistency import average_band as average_band
-from .evaluation.consistency import nees as nees
 from .evaluation.evaluate import evaluate as evaluate
-from .imu.initialise_moving import MovingStart as MovingStart
-from .imu.initialise_moving import initialise_moving as initialise_moving
+from .evaluation.trajectory_error import average_band as average_band
+from .evaluation.trajectory_error import nees as nees
 from .imu.path import deskew_along as deskew_along
 from .lidar.features import lio_sam_features as lio_sam_features
 from .lidar.features import loam_features as loam_features

@@ -46,8 +46,8 @@ def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("out/demo"), overwrite:
         out: Folder for the results.
         overwrite: Replace the results of an earlier run in that folder.
     """
-    from lio_jax.commands.demo import demo as command
     from lio_jax.commands.runtime import prepare_jax
+    from lio_jax.commands.sim import demo as command
 
     prepare_jax()
     command(out, overwrite)

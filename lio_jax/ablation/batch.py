@@ -13,14 +13,16 @@ from lio_jax.run.logs import Failures, Overflow, StageTimes, TrajectoryLog
 from lio_jax.run.run import check_start, imu_feed, nothing_read, prediction
 from lio_jax.run.sinks import RunResult, Sink, finish_all
 from lio_jax.run.track import Compiled, ResultBuilder, run_steps, scan_inputs
+from lio_jax.run.verdict import Verdict
 from lio_jax.settings.settings import Settings, recipe_of
 
 
 def same_batch(settings: Settings) -> tuple[Any, ...]:
     """Return what the members of a batch have to share."""
     offset = settings.values["extrinsics"]["time_offset"]
-    estimated = settings.values.get("initial", {}).get("time_offset_sigma", 0.0) > 0
-    return settings.recipe, settings.config, settings.run, offset, estimated
+    estimated = settings.values["initial"].get("time_offset_sigma", 0.0) > 0
+    velocity = tuple(settings.values["initial"]["velocity"])
+    return settings.recipe, settings.config, settings.run, offset, estimated, velocity
 
 
 def run_batch(
@@ -47,7 +49,8 @@ def run_batch(
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[one.params() for one in settings])
     judges = [ResultBuilder(one) for one in settings]
     sinks: list[list[Sink]] = [
-        [TrajectoryLog(), StageTimes("step", "total"), Failures(start), Overflow(one)] for one in settings
+        [TrajectoryLog(), StageTimes("step", "total"), Failures(start), Overflow(one), Verdict(one)]
+        for one in settings
     ]
     scans: Any = prefetched(sequence.scans(start, count), first.run.data.prefetch)
     stepper = Compiled(batched(recipe_of(first)), stacked)

@@ -18,6 +18,7 @@ from lio_jax.run.folder import run_folder, write_json
 from lio_jax.run.run import check_start, run_sequence, settings_for
 from lio_jax.run.sinks import RunResult, Sink
 from lio_jax.run.track import ScanResult
+from lio_jax.run.verdict import in_words
 from lio_jax.settings.settings import Settings, load_settings, recipe_settings, with_overrides
 from lio_jax.settings.translate import ForeignKey, ForeignSettings, load_foreign_settings
 from lio_jax.viz.recording import ViewerRecording
@@ -193,6 +194,7 @@ def run_into(
     result.metrics["notes"] = [*sequence.info.notes, *notes]
     evaluation_text = _finish(result, truth, settings, out, info.name)
     _warn(result.metrics["warnings"])
+    _warn(result.metrics["verdict"]["reasons"])
     _warn([failure["message"] for failure in result.metrics["failures"]])
     print(_summary(result, out), end="\n\n" if evaluation_text else "\n")
     if evaluation_text:
@@ -296,6 +298,7 @@ def _summary(result: RunResult, out: Path) -> str:
             f"compile    {metrics['compile_s']:.2f} s",
             f"wall       {metrics['wall_s']:.1f} s",
             f"memory     {metrics['peak_rss_mb']:.0f} MiB peak",
+            f"verdict    {in_words(metrics['verdict'])}",
             *corrected,
             f"results    {out}",
         ]

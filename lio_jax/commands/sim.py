@@ -208,3 +208,14 @@ def _summary(sequence: SimulatedSequence, out: Path, chosen: Format, rate: float
 
 def _plain(values: NDArray[np.float64]) -> str:
     return f"[{','.join(f'{value:.9g}' for value in values)}]"
+
+
+def demo(out: Path, overwrite: bool) -> None:
+    """Run the default recipe on twelve seconds of simulated driving."""
+    from lio_jax.commands.run import run_and_report
+    from lio_jax.commands.runtime import say
+    from lio_jax.settings.settings import Settings
+
+    sequence = SimulatedSequence(world="city", sensor="generic32", duration_s=12.0, imu=ImuModel())
+    say("simulating and tracking a 32-beam LiDAR and an IMU on twelve seconds of a city ...")
+    run_and_report(sequence, Settings(), out, 0, None, sequence.truth(), overwrite)

@@ -15,7 +15,7 @@ it.
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float, Int32
+from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.error_state import DOF, POSITION, ROTATION, VELOCITY
 from lio_jax.core.geometry import adjoint, from_blocks, rotation_matrix, skew
@@ -55,6 +55,15 @@ class MapDrift(eqx.Module):
         """
         share = jnp.select([scans == 0, scans == 1], [0.0, 1.0], share.astype(covariance.dtype))
         return MapDrift(self.covariance + share**2 * covariance[_POSE, _POSE])
+
+    def with_pose_of(self, covariance: Float[Array, "24 24"], begins: Bool[Array, ""]) -> "MapDrift":
+        """Return the drift of a new piece of map that begins at an uncertain pose.
+
+        Args:
+            covariance: of the state at which it begins, within the map so far.
+            begins: a new piece begins; otherwise the drift stays.
+        """
+        return MapDrift(self.covariance + jnp.where(begins, covariance[_POSE, _POSE], 0.0))
 
     def added_to(self, covariance: Float[Array, "24 24"], nav: NavState) -> Float[Array, "24 24"]:
         """Return the covariance of a state's error in the world, given its covariance within the map.

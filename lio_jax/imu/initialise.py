@@ -47,8 +47,8 @@ class RestStart(eqx.Module):
     """A first navigation state from samples that should be of a vehicle at rest."""
 
     start: NavEstimate
-    """The state and its covariance. At rest it is level, with the estimated biases and zero velocity. In
-    motion the level is rough, the biases are zero and the velocity is unknown."""
+    """The state and its covariance. At rest it is level, with the estimated biases. In motion the level is
+    rough, the biases are zero and the velocity is that of ``initial``."""
     is_still: Bool[Array, ""]
     """Whether the samples are those of a vehicle at rest."""
     accel_scale: Float[Array, ""]
@@ -78,7 +78,7 @@ def initialise_at_rest(
     Args:
         imu: about one second of samples before the first pose.
         params: the magnitude of gravity, and the noise densities, which bound the scatter at rest.
-        initial: prior standard deviations.
+        initial: first velocity and prior standard deviations.
         T_imu_lidar: extrinsic pose of the lidar in the IMU frame.
         time_offset: lag of the lidar's clock, s.
     """
@@ -87,6 +87,8 @@ def initialise_at_rest(
     signal = jnp.stack([imu.gyro, imu.accel])
     (gyro, accel), scatter = _mean_and_variance(signal, imu.mask)
     gyro_scatter, accel_scatter = jnp.mean(scatter, axis=1)
+    # at a constant speed in a bend the body's acceleration is the cross product of rate and velocity
+    accel = accel - jnp.cross(gyro, initial.velocity)
     accel = jnp.where(present, accel, jnp.array([0.0, 0.0, 1.0]) * params.gravity)
     strength = jnp.linalg.norm(accel)
     rate = _sample_rate(imu)
@@ -97,13 +99,17 @@ def initialise_at_rest(
         & (count >= MIN_SAMPLES)
         & (jnp.linalg.norm(gyro) < STILL_RATE)
         & (jnp.abs(strength / params.gravity - 1) < STILL_MISFIT)
+        # a vehicle that brakes steadily looks as if it stood on a slope
+        & jnp.all(initial.velocity == 0)
     )
 
+    level = levelled(accel / strength)
     nav = eqx.tree_at(
-        lambda n: (n.T_world_imu, n.gravity, n.time_offset),
+        lambda n: (n.T_world_imu, n.velocity, n.gravity, n.time_offset),
         initial_nav_state(T_imu_lidar),
         (
-            jaxlie.SE3.from_rotation(levelled(accel / strength)),
+            jaxlie.SE3.from_rotation(level),
+            level @ initial.velocity,
             jnp.array([0.0, 0.0, -1.0]) * params.gravity,
             time_offset,
         ),

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import equinox as eqx
+from jaxtyping import Array, Float
 
 from lio_jax.core.leaf import leaf, static
 from lio_jax.core.types import Scalar
@@ -23,8 +24,17 @@ class ImuParams(eqx.Module):
     """Magnitude of gravity."""
 
 
-class InitialParams(eqx.Module):
-    """Standard deviations of the first navigation state; zero freezes that part of the state."""
+class FirstMotionParams(eqx.Module):
+    """The motion at the first scan."""
+
+    velocity: Float[Array, "3"] = leaf((0.0, 0.0, 0.0), "m/s")
+    """First velocity, along the axes of the IMU at the first scan's end. Zero: the first two scans show it,
+    whatever the speed is."""
+
+
+class InitialParams(FirstMotionParams):
+    """First velocity, and standard deviations of the first navigation state; zero freezes that part of the
+    state."""
 
     rotation_sigma: Scalar = leaf(0.0, "rad", least=0, tuned="log")
     """Standard deviation of the first roll and pitch. Zero is consistent with a map that starts at the first

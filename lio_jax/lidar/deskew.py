@@ -37,6 +37,16 @@ def deskew_constant_velocity(
     return rotated + shift + b[:, None] * swept + c[:, None] * jnp.cross(omega, swept)
 
 
+def twist_without_turn(velocity: Float[Array, "3"], T_imu_lidar: jaxlie.SE3) -> Float[Array, "6"]:
+    """Return the velocity of the lidar in its own frame, m/s then rad/s, while the body does not turn.
+
+    Args:
+        velocity: of the IMU, along its own axes, m/s.
+        T_imu_lidar: extrinsic pose of the lidar in the IMU frame.
+    """
+    return jnp.concatenate([T_imu_lidar.rotation().inverse() @ velocity, jnp.zeros_like(velocity)])
+
+
 class TrialMotion(eqx.Module):
     """The motion from one instant to the middle of a scan."""
 

@@ -24,6 +24,7 @@ _WEIGHTLESS = 1e-9
 def unlevelled_start(params: InertialParams) -> NavEstimate:
     """Return the state at the world's origin, with its first pose as the world's axes and any velocity."""
     nav = initial_nav_state(params.extrinsics.T_imu_lidar())
+    nav = dataclasses.replace(nav, velocity=params.initial.velocity)
     # biases, gravity and the extrinsic are not observable apart from the motion: they do not change
     sigma = jnp.zeros(DOF, nav.velocity.dtype).at[VELOCITY].set(MOVING_SPEED)
     return NavEstimate(nav, jnp.diag(sigma**2))

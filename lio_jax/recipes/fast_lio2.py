@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int32
 from lio_jax.core.error_state import NavEstimate
 from lio_jax.core.leaf import section, static
 from lio_jax.core.types import ITERATION_LIMIT, ImuBatch, NavState, Scan
+from lio_jax.estimation.map_drift import MapDrift
 from lio_jax.imu.params import ImuParams, InitialParams
 from lio_jax.imu.path import deskew_along
 from lio_jax.lidar.params import LidarParams, ScanConfig
@@ -37,13 +38,14 @@ from lio_jax.recipes.constant_velocity import (
 from lio_jax.recipes.inertial_filter import (
     corrected,
     evidence_of,
+    in_new_piece,
     levelled_start,
     lidar_pose,
     predicted,
     registration_of,
 )
 from lio_jax.recipes.params import InertialConfig, InertialParams
-from lio_jax.recipes.recipe import Needs, Output, Recipe
+from lio_jax.recipes.recipe import Needs, Outage, Output, Recipe
 from lio_jax.registration.knn_planes import ScanToPoints
 from lio_jax.registration.params import (
     FilterMatch,
@@ -151,6 +153,10 @@ class FastLio2State(recipe.State):
     """Time from that instant to the scan's end, s."""
     scans: Int32[Array, ""]
     """Number of scans with points so far."""
+    drift: MapDrift
+    """Errors of the predicted poses at which pieces of the map began."""
+    unmatched: Float[Array, ""]
+    """Time since the last scan that was matched, s."""
     map: PointMap
 
     def with_velocity_of(self, found: "FastLio2State") -> "FastLio2State":
@@ -185,6 +191,8 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
             rate=none,
             to_end=none[0],
             scans=jnp.int32(0),
+            drift=MapDrift.none(start.covariance.dtype),
+            unmatched=none[0],
             map=empty_map(config.map.capacity),
         )
 
@@ -200,13 +208,16 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
             imu: samples around that time.
         """
         config = self.config
-        first = state.scans == 0
+        first, interval = state.scans == 0, scan.interval
         voxel_size = params.map.voxel_size.astype(jnp.float32)
         with jax.named_scope("predict"):
             if imu is None:
                 to_end = scan.duration.astype(state.to_end.dtype) / 2
                 scan = until_its_middle(scan, state.to_end)
-                prior, path = predicted_without_samples(params, state.uncertain, state.rate, scan, first)
+                # the first scan's end is the world's origin
+                opened = carried_on(state.uncertain.nav, state.rate, jnp.where(first, -to_end, 0.0))
+                last = NavEstimate(opened, state.uncertain.covariance)
+                prior, path = predicted_without_samples(params, last, state.rate, scan, first)
             else:
                 to_end = jnp.zeros_like(state.to_end)
                 # as FAST-LIO2 does, the match is taken for one of the pose at the scan's end
@@ -219,10 +230,11 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
             thin = mean_per_voxel(points, in_range, spacing, config.lidar.registration_points)
         with jax.named_scope("update"):
             frame = Frame(*anchor_of(T_predicted.translation(), EDGE * params.map.voxel_size))
+            outage = Outage.at(params, state.unmatched + interval, thin.mask)
             match = ScanToPoints(
                 points_at=FixedPoints(thin.points),
                 T_predicted=T_predicted,
-                registration=params.registration,
+                registration=outage.required(params.registration),
                 map=state.map,
                 mask=thin.mask,
                 map_params=params.map,
@@ -234,6 +246,7 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
             update, _ = corrected(prior, match, config.registration.max_iterations)
             posterior: NavEstimate = update.state
             lost = (update.status > ITERATION_LIMIT) & ~first
+            new_piece = outage.begins_piece(lost, params.registration)
             T_world_lidar = lidar_pose(posterior.nav)
         with jax.named_scope("insert"):
             # the map is a constant of the derivative
@@ -244,7 +257,7 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
             cube_map, added = insert(
                 state.map,
                 placed,
-                thin.mask & ~lost,
+                thin.mask & (~lost | new_piece),
                 frame.anchor,
                 voxel_size,
                 in_blocks[0],
@@ -253,6 +266,8 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
             # last: XLA copies the map if another operation reads it afterwards
             cube_map = move_cube(cube_map, frame.anchor, *in_blocks)
 
+        drift = state.drift.carried(state.uncertain.nav.T_world_imu, posterior.nav.T_world_imu)
+        posterior, drift = in_new_piece(posterior, drift, jnp.zeros_like(to_end), new_piece)
         seen = jnp.any(thin.mask)
         rate = jnp.where(first | lost, state.rate, mean_rate(state.uncertain.nav, posterior.nav, scan))
         new_state = FastLio2State(
@@ -261,6 +276,8 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
             rate=rate,
             to_end=to_end,
             scans=state.scans + seen.astype(jnp.int32),
+            drift=drift,
+            unmatched=outage.after((first & ~seen) | (lost & ~new_piece)),
             map=cube_map,
         )
         return new_state, Output(
@@ -274,7 +291,8 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
             origin=frame.origin,
             thinned_away=thin.dropped,
             map_dropped=added.dropped,
-            covariance=posterior.covariance,
+            covariance=drift.added_to(posterior.covariance, posterior.nav),
+            new_piece=new_piece,
             evidence=evidence_of(update, prior),
         )
 

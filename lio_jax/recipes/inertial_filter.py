@@ -24,6 +24,7 @@ from lio_jax.core.error_state import (
 from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import Measurement, Update
+from lio_jax.estimation.map_drift import MapDrift
 from lio_jax.estimation.nav_update import predicted_pose_covariance, update_nav
 from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.imu.initialise import initialise_at_rest
@@ -221,3 +222,29 @@ def evidence_of(update: Update, prior: SweptState, points: PointEvidence | None 
         pose_covariance=predicted_pose_covariance(prior),
         points=points,
     )
+
+
+def in_new_piece(
+    state: NavEstimate, drift: MapDrift, sweep: Float[Array, ""], begins: Bool[Array, ""]
+) -> tuple[NavEstimate, MapDrift]:
+    """Return state and drift with the pose's error moved into the drift where a new piece of map begins.
+
+    Within the new piece the pose is certain. What is known of the velocity and of gravity's direction
+    relative to the body stays known.
+
+    Args:
+        state: predicted, at the sweep's end.
+        drift: of the map so far.
+        sweep: the scan's duration, s: the pose is certain in the sweep's mean.
+        begins: a new piece begins.
+    """
+    nav, covariance = state.nav, state.covariance
+    dtype = covariance.dtype
+    R_world_imu = rotation_matrix(nav.T_world_imu.rotation())
+    moved = jnp.eye(DOF, dtype=dtype).at[ROTATION].set(0.0).at[POSITION].set(0.0)
+    moved = moved.at[VELOCITY, ROTATION].set(skew(R_world_imu.T @ nav.velocity))
+    moved = moved.at[GRAVITY, ROTATION].set(-sphere_basis(nav.gravity).T @ R_world_imu)
+    moved = moved.at[POSITION, VELOCITY].set(sweep / 2 * jnp.eye(3, dtype=dtype))
+    within = moved @ covariance @ moved.T
+    kept = NavEstimate(nav, jnp.where(begins, (within + within.T) / 2, covariance))
+    return kept, drift.with_pose_of(covariance, begins)

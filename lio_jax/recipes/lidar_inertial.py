@@ -22,12 +22,13 @@ from lio_jax.recipes.default_params import DefaultConfig, DefaultParams
 from lio_jax.recipes.inertial_filter import (
     corrected,
     evidence_of,
+    in_new_piece,
     levelled_start,
     lidar_pose,
     predicted,
     registration_of,
 )
-from lio_jax.recipes.recipe import Output
+from lio_jax.recipes.recipe import Outage, Output
 from lio_jax.registration.point_evidence import point_evidence
 from lio_jax.registration.scan_match import FixedPoints
 from lio_jax.registration.voxel_planes import ScanToVoxels
@@ -45,6 +46,8 @@ class InertialState(recipe.State):
     """Expected error of the next prediction, m; the robust kernel is wide enough for it."""
     scans: Int32[Array, ""]
     """Number of scans with points so far."""
+    unmatched: Float[Array, ""]
+    """Time since the last scan that was matched, s."""
     map: VoxelMap
 
     @property
@@ -73,6 +76,7 @@ def init(config: DefaultConfig, params: DefaultParams, imu: ImuBatch) -> Inertia
         drift=MapDrift.none(dtype),
         prediction_error=jnp.asarray(params.motion.initial_error, dtype),
         scans=jnp.int32(0),
+        unmatched=jnp.zeros((), dtype),
         map=empty_map(config.map.capacity),
     )
 
@@ -99,11 +103,12 @@ def step(
         still = jax.lax.stop_gradient((path, prior.nav.T_imu_lidar))
         points = deskew_along(*still, thin.points, thin.time)
         to_match = _to_match(path, prior.nav.T_imu_lidar, thin, points)
+        outage = Outage.at(params, state.unmatched + scan.interval, thin.matched.mask)
     with jax.named_scope("update"):
         match = ScanToVoxels(
             points_at=FixedPoints(to_match),
             T_predicted=T_predicted,
-            registration=params.registration,
+            registration=outage.required(params.registration),
             map=state.map,
             mask=thin.matched.mask,
             prediction_error=state.prediction_error,
@@ -113,6 +118,7 @@ def step(
         update, matched = corrected(prior, match, config.registration.max_iterations)
         posterior: NavEstimate = update.state
         lost = (update.status > ITERATION_LIMIT) & ~first
+        new_piece = outage.begins_piece(lost, params.registration)
         T_world_lidar, T_matched = lidar_pose(posterior.nav), lidar_pose(matched)
         frame, matches = match.frame(), update.measurement.aux.association.found
         evidence = point_evidence(matches, to_match, T_matched, frame, params.lidar, params.registration)
@@ -124,7 +130,7 @@ def step(
         vmap, added = insert(
             state.map,
             placed,
-            thin.mask & ~lost,
+            thin.mask & (~lost | new_piece),
             frame.anchor,
             params.map.voxel_size.astype(jnp.float32),
             params.map.reach.astype(jnp.float32),
@@ -132,14 +138,20 @@ def step(
 
         new = jnp.sum(added.added) / jnp.maximum(jnp.sum(thin.mask), 1)
         drift = state.drift.carried(state.nav.T_world_imu, posterior.nav.T_world_imu)
+        within, drift = in_new_piece(posterior, drift, scan.duration, new_piece)
 
     new_state = InertialState(
-        nav=posterior.nav,
-        covariance=posterior.covariance,
-        drift=drift.grown(posterior.covariance, new, state.scans),
+        nav=within.nav,
+        covariance=within.covariance,
+        drift=drift.grown(within.covariance, new, state.scans),
         # it only opens the kernel, which is closed at the solution
-        prediction_error=jax.lax.stop_gradient(jnp.where(first | lost, state.prediction_error, error)),
+        prediction_error=jax.lax.stop_gradient(
+            jnp.select(
+                [new_piece, first | lost], [params.motion.initial_error, state.prediction_error], error
+            )
+        ),
         scans=state.scans + jnp.any(thin.mask).astype(jnp.int32),
+        unmatched=outage.after((first & ~jnp.any(thin.mask)) | (lost & ~new_piece)),
         map=vmap,
     )
     return new_state, Output(
@@ -153,7 +165,8 @@ def step(
         origin=frame.origin,
         thinned_away=thin.dropped,
         map_dropped=added.dropped,
-        covariance=drift.added_to(posterior.covariance, posterior.nav),
+        covariance=drift.added_to(within.covariance, within.nav),
+        new_piece=new_piece,
         evidence=evidence_of(update, prior, evidence),
     )
 

@@ -3,6 +3,8 @@
 scan -> thin -> predict -> register (deskewing under trial) -> deskew -> insert -> map
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,13 +12,13 @@ import jaxlie
 from jaxtyping import Array, Float, Int32
 
 from lio_jax.core.types import LOST, NavState, Scan, initial_nav_state
-from lio_jax.lidar.deskew import TrialMotion, deskew_constant_velocity
+from lio_jax.lidar.deskew import TrialMotion, deskew_constant_velocity, twist_without_turn
 from lio_jax.lidar.thinning import thinned
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
 from lio_jax.recipes import recipe
 from lio_jax.recipes.default_params import DefaultConfig, DefaultParams
-from lio_jax.recipes.recipe import Output
+from lio_jax.recipes.recipe import Outage, Output
 from lio_jax.registration.gauss_newton import gauss_newton
 from lio_jax.registration.voxel_planes import ScanToVoxels
 
@@ -36,6 +38,8 @@ class LidarState(recipe.State):
     """Expected error of the next prediction, m."""
     scans: Int32[Array, ""]
     """Number of scans with points so far."""
+    unmatched: Float[Array, ""]
+    """Time since the last scan that was matched, s."""
     map: VoxelMap
 
     def with_velocity_of(self, found: "LidarState") -> "LidarState":
@@ -51,14 +55,16 @@ def init(config: DefaultConfig, params: DefaultParams) -> LidarState:
         params: traced.
     """
     nav = initial_nav_state(params.extrinsics.T_imu_lidar())
+    nav = dataclasses.replace(nav, velocity=params.initial.velocity)
     dtype = nav.velocity.dtype
     return LidarState(
         nav=nav,
         T_world_lidar=nav.T_world_imu @ nav.T_imu_lidar,
         mid_to_end=jnp.zeros((), dtype),
-        twist=jnp.zeros(6, dtype),
+        twist=twist_without_turn(nav.velocity, nav.T_imu_lidar),
         prediction_error=jnp.asarray(params.motion.initial_error, dtype),
         scans=jnp.int32(0),
+        unmatched=jnp.zeros((), dtype),
         map=empty_map(config.map.capacity),
     )
 
@@ -85,13 +91,14 @@ def step(
         first, T_last = state.scans == 0, state.T_world_lidar
         motion = TrialMotion.since(state.twist, state.mid_to_end, scan, first)
         prediction = T_last @ motion.predicted()
+        outage = Outage.at(params, state.unmatched + scan.interval, thin.matched.mask)
 
     with jax.named_scope("register"):
         index = thin.matched.index
         match = ScanToVoxels(
             points_at=_Deskewed(thin.points[index], thin.time[index], motion, T_last),
             T_predicted=prediction,
-            registration=params.registration,
+            registration=outage.required(params.registration),
             map=state.map,
             mask=thin.matched.mask,
             prediction_error=state.prediction_error,
@@ -100,11 +107,13 @@ def step(
         )
         result = gauss_newton(match, config.registration.max_iterations)
         lost = (result.status == LOST) & ~first
+        new_piece = outage.begins_piece(lost, params.registration)
         twist = jnp.where(lost, state.twist, motion.twist_to(T_last.inverse() @ result.T_world_lidar))
         missed = jnp.linalg.norm((prediction.inverse() @ result.T_world_lidar).translation())
         error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
         # it only opens the kernel, which is closed at the solution
-        error = jax.lax.stop_gradient(jnp.where(first | lost, state.prediction_error, error))
+        known = jnp.where(new_piece, params.motion.initial_error, state.prediction_error)
+        error = jax.lax.stop_gradient(jnp.where(first | lost, known, error))
     with jax.named_scope("insert"):
         T = result.T_world_lidar
         anchor, corner = anchor_of(T.translation(), params.map.voxel_size)
@@ -113,7 +122,7 @@ def step(
         vmap, added = insert(
             state.map,
             anchored,
-            thin.mask & ~lost,
+            thin.mask & (~lost | new_piece),
             anchor,
             params.map.voxel_size.astype(jnp.float32),
             params.map.reach.astype(jnp.float32),
@@ -133,6 +142,7 @@ def step(
         twist=twist,
         prediction_error=error,
         scans=state.scans + seen.astype(jnp.int32),
+        unmatched=outage.after((first & ~seen) | (lost & ~new_piece)),
         map=vmap,
     )
     return new_state, Output(
@@ -146,6 +156,7 @@ def step(
         origin=corner,
         thinned_away=thin.dropped,
         map_dropped=added.dropped,
+        new_piece=new_piece,
     )
 
 

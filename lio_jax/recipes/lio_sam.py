@@ -22,6 +22,7 @@ from lio_jax.core.error_state import DOF as NAV_DOF
 from lio_jax.core.errors import UsageError
 from lio_jax.core.geometry import from_blocks
 from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, ImuBatch, NavState, Scan, state_dtype
+from lio_jax.estimation.map_drift import MapDrift
 from lio_jax.estimation.motion_state import DOF
 from lio_jax.estimation.sliding_window import Window, log_evidence
 from lio_jax.estimation.smoother import Smoothed
@@ -103,6 +104,7 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
             time=zero,
             matched_at=zero - jnp.inf,
             scans=jnp.int32(0),
+            drift=MapDrift.none(zero.dtype),
             map=Submap(keyframes, empty_feature_map(config.map.capacity)),
         )
 
@@ -132,15 +134,20 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
         nav = dataclasses.replace(as_nav(state.nav, smoothing.window), T_world_imu=smoothing.T_world_imu)
         with jax.named_scope("keyframe"):
             added = keyframe(params, state, clock, points, nav, features, match, smoothing.failed)
+        covariance = _covariance(smoothing.smoothed, smoothing.window)
+        drift = state.drift.carried(state.nav.T_world_imu, nav.T_world_imu)
+        drift = drift.with_pose_of(covariance, match.new_piece)
         new_state = LioSamState(
             nav=nav,
             window=smoothing.window,
             time=clock.time,
-            matched_at=jnp.where(match.used, clock.time, state.matched_at),
+            matched_at=jnp.where(match.used | match.new_piece, clock.time, state.matched_at),
             scans=state.scans + features.seen.astype(jnp.int32),
+            drift=drift,
             map=added.submap,
         )
-        return new_state, _output(nav, clock, features, match, smoothing, added)
+        output = _output(nav, clock, features, match, smoothing, added)
+        return new_state, dataclasses.replace(output, covariance=drift.added_to(covariance, nav))
 
 
 def _output(
@@ -165,7 +172,7 @@ def _output(
         origin=frames.surface.origin,
         thinned_away=features.dropped,
         map_dropped=added.corner.dropped + added.surface.dropped,
-        covariance=_covariance(smoothed, smoothing.window),
+        new_piece=match.new_piece,
         log_evidence=log_evidence(smoothing.window.chain, smoothed),
         corners=jnp.arange(corners + surfaces) < corners,
         restarted=smoothing.failed,

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.types import LOST, ImuBatch, NavState, Scan, state_dtype
 from lio_jax.estimation.chain import information_of, linearise
+from lio_jax.estimation.map_drift import MapDrift
 from lio_jax.estimation.sliding_window import Added, Window, append_and_update
 from lio_jax.estimation.smoother import Smoothed
 from lio_jax.imu.path import Path, deskew_along
@@ -33,6 +34,7 @@ from lio_jax.mapping.point_map import PointInsertion
 from lio_jax.recipes import recipe
 from lio_jax.recipes.inertial_filter import lidar_pose
 from lio_jax.recipes.lio_sam_params import LioSamConfig, LioSamParams
+from lio_jax.recipes.recipe import Outage
 from lio_jax.recipes.smoothed_odometry import (
     drawn_to_tilt,
     match_as_measurement,
@@ -62,6 +64,8 @@ class LioSamState(recipe.State):
     """The same of the last scan that was matched."""
     scans: Int32[Array, ""]
     """Scans with points seen so far."""
+    drift: MapDrift
+    """Errors of the predicted poses at which pieces of the map began."""
     map: Submap
 
     def with_velocity_of(self, found: "LioSamState") -> "LioSamState":
@@ -181,6 +185,8 @@ class MapMatch(eqx.Module):
     used: Bool[Array, ""]
     lost: Bool[Array, ""]
     """The scan could not be matched although there was a map."""
+    new_piece: Bool[Array, ""]
+    """A new piece of map begins with the scan, at the predicted pose."""
 
 
 def scan_to_map(
@@ -206,10 +212,11 @@ def scan_to_map(
         enough: there are features enough to match.
     """
     guess, T_imu_lidar = prediction.T_world_imu, state.nav.T_imu_lidar
+    outage = Outage.at(params, clock.time - jnp.maximum(state.matched_at, 0.0), points.together()[1])
     match = ScanToSubmap(
         points_at=FixedPoints(points),
         T_predicted=jaxlie.SE3((guess @ T_imu_lidar).wxyz_xyz),
-        registration=params.registration,
+        registration=outage.required(params.registration),
         lidar=params.lidar,
         map=state.map.features,
         map_params=params.map,
@@ -223,7 +230,9 @@ def scan_to_map(
     T_matched = within_limits(found.T_world_lidar, params.smoother) @ T_imu_lidar.inverse()
     attitude, _ = measured_attitude(imu, clock.end + state.nav.time_offset, guess.rotation())
     T_matched = drawn_to_tilt(T_matched, attitude, params.smoother.tilt_weight)
-    return MapMatch(found, jaxlie.SE3(jnp.where(used, T_matched.wxyz_xyz, guess.wxyz_xyz)), used, lost)
+    T_world_imu = jaxlie.SE3(jnp.where(used, T_matched.wxyz_xyz, guess.wxyz_xyz))
+    new_piece = lost & enough & outage.is_long
+    return MapMatch(found, T_world_imu, used, lost, new_piece)
 
 
 class Smoothing(eqx.Module):
@@ -335,24 +344,22 @@ def keyframe(
     """Make the scan a keyframe where its pose is sound and far enough from the last keyframe's.
 
     Args:
-        params: ``params.submap``, ``params.point_map``, ``params.limits.outage`` and the voxel sizes.
+        params: ``params.submap``, ``params.point_map`` and the voxel sizes.
         state: after the scan before; its map is donated.
         clock: of the scan.
         points: compensated features, m, lidar frame of the scan's end.
         nav: at the scan's end.
-        features: whether there are enough.
+        features: whether the scan counts.
         match: the scan's.
         failed: the smoother ran away.
     """
     # the map is a constant of the derivative
     T_world_lidar, still = jax.lax.stop_gradient((lidar_pose(nav), points))
-    away = clock.time - jnp.maximum(state.matched_at, 0.0) > params.limits.outage
-    # where the map does not reach, a new piece of it begins at the prediction
-    sound = (match.used | (match.lost & features.enough & away)) & ~failed
+    sound = (match.used | match.new_piece) & ~failed
     sound = sound | (clock.first & features.seen)
     submap, frames, placed, added = with_scan(
         state.map,
-        sound & is_due(state.map.keyframes, T_world_lidar, params.submap),
+        sound & (is_due(state.map.keyframes, T_world_lidar, params.submap) | match.new_piece),
         still,
         T_world_lidar,
         jax.lax.stop_gradient(clock.time),

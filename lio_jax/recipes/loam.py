@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.leaf import section, static
 from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, LOST, ImuBatch, NavState, Scan, initial_nav_state
-from lio_jax.lidar.deskew import TrialMotion
+from lio_jax.lidar.deskew import TrialMotion, twist_without_turn
 from lio_jax.lidar.features import (
     FeatureCloud,
     LoamFeatures,
@@ -40,7 +40,7 @@ from lio_jax.mapping.feature_map import (
 from lio_jax.mapping.params import CubeGridParams, FeatureMapParams, MapConfig, PointMapParams
 from lio_jax.recipes import recipe
 from lio_jax.recipes.params import RecipeConfig, RecipeParams
-from lio_jax.recipes.recipe import Needs, Output, Recipe
+from lio_jax.recipes.recipe import Needs, Outage, Output, Recipe
 from lio_jax.registration.feature_match import ScanToCubes
 from lio_jax.registration.gauss_newton import Registration, gauss_newton
 from lio_jax.registration.params import (
@@ -133,6 +133,8 @@ class LoamState(recipe.State):
     """Velocity of the lidar in its own frame, m/s then rad/s."""
     scans: Int32[Array, ""]
     """Number of scans with points so far."""
+    unmatched: Float[Array, ""]
+    """Time since the last scan that was matched, s."""
     map: Targets
 
     def with_velocity_of(self, found: "LoamState") -> "LoamState":
@@ -158,6 +160,7 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
         features = config.features
         check_sizes(config)
         nav = initial_nav_state(params.extrinsics.T_imu_lidar())
+        nav = dataclasses.replace(nav, velocity=params.initial.velocity)
         dtype = nav.velocity.dtype
         start = nav.T_world_imu @ nav.T_imu_lidar
         corners = features.corners * features.sectors * features.rings
@@ -166,8 +169,9 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             T_odom_lidar=jaxlie.SE3(jnp.array([1, 0, 0, 0, 0, 0, 0], dtype)),
             T_map_odom=jaxlie.SE3(start.wxyz_xyz),
             since=jnp.zeros((), dtype),
-            twist=jnp.zeros(6, dtype),
+            twist=twist_without_turn(nav.velocity, nav.T_imu_lidar),
             scans=jnp.int32(0),
+            unmatched=jnp.zeros((), dtype),
             map=Targets(
                 empty_feature_map(config.map.capacity),
                 empty_scan(corners, features.surface_points, features.rings),
@@ -212,6 +216,10 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
                 jnp.where(opening, jnp.int32(config.loam.opening_rounds), jnp.int32(config.loam.rounds)),
                 config.registration.max_iterations,
             )
+            # after an outage the last scan shows another place
+            bridged = motion.elapsed > params.limits.outage
+            T_last_lidar = jnp.where(bridged, motion.predicted().wxyz_xyz, odometry.T_world_lidar.wxyz_xyz)
+            odometry = dataclasses.replace(odometry, T_world_lidar=jaxlie.SE3(T_last_lidar))
             T_odom_lidar = state.T_odom_lidar @ odometry.T_world_lidar
             twist = motion.twist_to(odometry.T_world_lidar)
         with jax.named_scope("scan_to_map"):
@@ -223,8 +231,10 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             thin = _Compensated(corner, surface, motion, config.loam.compensate)(odometry.T_world_lidar)
             guess = state.T_map_odom @ T_odom_lidar
             its_turn = state.scans % config.loam.mapping_every == 0
-            mapping = _mapped(config, params, state.map.cubes, thin, guess, odometry, its_turn)
+            outage = Outage.at(params, state.unmatched + scan.interval, thin.together()[1])
+            mapping = _mapped(config, params, outage, state.map.cubes, thin, guess, odometry, its_turn)
             lost = (mapping.status == LOST) & ~first
+            new_piece = outage.begins_piece(lost, params.registration)
             T = mapping.T_world_lidar
         with jax.named_scope("insert"):
             # the map is a constant of the derivative
@@ -234,7 +244,7 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             cubes, *added = added_to_cubes(
                 state.map.cubes,
                 placed,
-                its_turn & ~lost,
+                its_turn & (~lost | new_piece),
                 frames,
                 params.map,
                 params.point_map,
@@ -258,6 +268,9 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             since=of_odometry[1],
             twist=twist,
             scans=state.scans + jnp.any(features.less_flat.mask).astype(jnp.int32),
+            unmatched=outage.after((first & ~jnp.any(features.less_flat.mask)) | (lost & ~new_piece)).astype(
+                state.unmatched.dtype
+            ),
             map=Targets(cubes, of_odometry[2]),
         )
         corner_offset = (frames.corner.origin - frames.surface.origin).astype(placed.corner.dtype)
@@ -272,6 +285,7 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             origin=frames.surface.origin,
             thinned_away=thinned_away + features.dropped,
             map_dropped=added[0].dropped + added[1].dropped,
+            new_piece=new_piece,
             corners=jnp.arange(len(placed.corner_mask) + len(placed.surface_mask)) < len(placed.corner_mask),
         )
 
@@ -296,6 +310,7 @@ class _Compensated(eqx.Module):
 def _mapped(
     config: LoamConfig,
     params: LoamParams,
+    outage: Outage,
     cubes: FeatureMap,
     points: FeaturePoints,
     guess: jaxlie.SE3,
@@ -308,7 +323,7 @@ def _mapped(
         match = ScanToCubes(
             points_at=FixedPoints(points),
             T_predicted=guess,
-            registration=params.registration,
+            registration=outage.required(params.registration),
             lidar=params.lidar,
             map=cubes,
             map_params=params.map,

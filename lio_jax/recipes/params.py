@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from lio_jax.core.leaf import leaf, section
 from lio_jax.core.types import Scalar
-from lio_jax.imu.params import ImuConfig, ImuParams, InitialParams
+from lio_jax.imu.params import FirstMotionParams, ImuConfig, ImuParams, InitialParams
 from lio_jax.lidar.params import LidarParams, ScanConfig
 from lio_jax.mapping.params import MapConfig, MapParams
 from lio_jax.registration.params import RegistrationConfig, RegistrationParams
@@ -18,14 +18,15 @@ from lio_jax.registration.params import RegistrationConfig, RegistrationParams
 class LimitParams(eqx.Module):
     """What is reported as a failure when it is exceeded; lio_sam begins anew there."""
 
-    speed: Scalar = leaf(30.0, "m/s", above=0)
+    speed: Scalar = leaf(60.0, "m/s", above=0)
     """Largest plausible speed."""
     gyro_bias: Scalar = leaf(1.0, "rad/s", above=0)
     """Largest plausible gyroscope bias."""
     accel_bias: Scalar = leaf(1.0, "m/s^2", above=0)
     """Largest plausible accelerometer bias."""
     outage: Scalar = leaf(1.0, "s", above=0)
-    """Largest time between two scans."""
+    """Longest time without a matched scan. After it, a scan that meets less than a quarter of the map begins
+    a new piece of map at the predicted pose."""
 
 
 class MotionParams(eqx.Module):
@@ -63,6 +64,7 @@ class RecipeParams(eqx.Module):
     lidar: LidarParams = section(LidarParams)
     map: MapParams = section(MapParams)
     registration: RegistrationParams = section(RegistrationParams)
+    initial: FirstMotionParams = section(FirstMotionParams)
     limits: LimitParams = section(LimitParams)
     extrinsics: ExtrinsicsParams = section(ExtrinsicsParams)
 

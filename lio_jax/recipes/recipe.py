@@ -1,17 +1,20 @@
 """What a recipe is: a static config, traced parameters, and two pure functions from scan to scan."""
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.innovation import Innovation
 from lio_jax.recipes.params import RecipeConfig, RecipeParams
 from lio_jax.registration.gauss_newton import Registration
+from lio_jax.registration.params import RegistrationParams
 from lio_jax.registration.point_evidence import PointEvidence
 
 
@@ -61,6 +64,8 @@ class Output(eqx.Module):
     """Statistics of the match; None from recipes without a covariance."""
     log_evidence: Float[Array, ""] | None = None
     """Log marginal likelihood of all measurements since the smoother's start; None without a smoother."""
+    new_piece: Bool[Array, ""] | None = None
+    """True if a new piece of map begins with the scan, at the predicted pose."""
     restarted: Bool[Array, ""] | None = None
     """True if the smoother diverged and was started again; None from recipes without a smoother."""
     smoother_unfinished: Bool[Array, ""] | None = None
@@ -85,6 +90,64 @@ class State(eqx.Module):
         """
 
 
+M = TypeVar("M", bound=RegistrationParams)
+C = TypeVar("C", bound=RecipeConfig)
+P = TypeVar("P", bound=RecipeParams)
+S = TypeVar("S", bound=State)
+
+_CONVINCING = 0.25
+"""Share of a scan's points that have to meet the map after an outage."""
+_ENOUGH = 4.0
+"""A scan begins a new piece of map if it has this many times ``params.registration.min_matches`` points."""
+
+
+class Outage(eqx.Module):
+    """The time since the last scan that was matched, and what it requires of the next match.
+
+    Where no scan was matched for longer than ``params.limits.outage``, the prediction may be wrong by more
+    than a scan match can mend, or the vehicle has left the map. A scan that meets little of the map is then
+    not matched by accident: it begins a new piece of map at the predicted pose, and odometry goes on from
+    there.
+    """
+
+    elapsed: Float[Array, ""]
+    """s."""
+    is_long: Bool[Array, ""]
+    """Longer than ``params.limits.outage``."""
+    usable: Int32[Array, ""]
+    """Number of points of the scan that could be matched."""
+
+    @staticmethod
+    def at(params: RecipeParams, elapsed: Float[Array, ""], mask: Bool[Array, " n"]) -> "Outage":
+        """Return the outage before a scan.
+
+        Args:
+            params: ``params.limits.outage``.
+            elapsed: time since the last scan that was matched, s.
+            mask: True for the points of the scan that could be matched.
+        """
+        return Outage(elapsed, elapsed > params.limits.outage, jnp.sum(mask, dtype=jnp.int32))
+
+    def required(self, registration: M) -> M:
+        """Return the parameters with the number of matches that is required here."""
+        share = jnp.where(self.is_long, _CONVINCING * self.usable, 0.0)
+        needed = jnp.maximum(registration.min_matches, share.astype(registration.min_matches.dtype))
+        return dataclasses.replace(registration, min_matches=needed)
+
+    def begins_piece(self, lost: Bool[Array, ""], registration: RegistrationParams) -> Bool[Array, ""]:
+        """Return whether a new piece of map begins with the scan.
+
+        Args:
+            lost: the scan could not be matched.
+            registration: the recipe's own.
+        """
+        return lost & self.is_long & (self.usable >= _ENOUGH * registration.min_matches)
+
+    def after(self, unmatched: Bool[Array, ""]) -> Float[Array, ""]:
+        """Return the time since the last match after this scan, s; ``unmatched``: it was not matched."""
+        return jnp.where(unmatched, self.elapsed, 0.0)
+
+
 @dataclass(frozen=True)
 class Needs:
     """What a recipe needs from a recording."""
@@ -95,11 +158,6 @@ class Needs:
     """True if the recipe finds features along the sensor's rings."""
     point_times: bool = True
     """True if the recipe compensates the motion within a sweep whose points have times."""
-
-
-C = TypeVar("C", bound=RecipeConfig)
-P = TypeVar("P", bound=RecipeParams)
-S = TypeVar("S", bound=State)
 
 
 @dataclass(frozen=True)

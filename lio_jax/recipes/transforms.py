@@ -6,6 +6,9 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
 
 from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.recipes.recipe import State
@@ -137,8 +140,13 @@ def _is_state(node: Any) -> bool:
 class Stepper(Protocol):
     """What takes an estimate from scan to scan; its state is a recipe's, or a transformed recipe's."""
 
-    def init(self, imu: ImuBatch | None) -> Any:
-        """Return the state before the first scan; ``imu``: samples up to its end, or None."""
+    def init(self, imu: ImuBatch | None, velocity: NDArray[np.float64] | None = None) -> Any:
+        """Return the state before the first scan.
+
+        Args:
+            imu: samples up to its end, or None.
+            velocity: (3,) replaces ``params.initial.velocity``, m/s; None: it holds.
+        """
         ...
 
     def step(self, state: Any, scan: Scan, imu: ImuBatch | None) -> tuple[Any, Any]:
@@ -165,20 +173,51 @@ class StepInput(Protocol):
         """Return the samples up to its end, for a start here."""
         ...
 
+    @property
+    def first_velocity(self) -> NDArray[np.float64] | None:
+        """Return the velocity at the first scan's end that this second scan shows, m/s, IMU axes; or None."""
+        ...
 
-def reopened(stepper: Stepper, state: Any, first: StepInput, second: StepInput) -> Any:
-    """Return the state after the first scan, compensated with the velocity that the second one shows.
 
-    Only the second scan tells how fast a vehicle is moving from the start; until then the map holds the first
+def reopened(
+    stepper: Stepper, state: Any, output: Any, first: StepInput, second: StepInput
+) -> tuple[Any, Any]:
+    """Return state and output after the first scan, compensated with the velocity that the second one shows.
+
+    Only the second scan shows how fast a vehicle is moving from the start; until then the map holds the first
     scan distorted.
 
     Args:
         stepper: of the run.
         state: after the first scan; it is consumed.
-        first: the first scan with points.
-        second: the next one with points.
+        output: of the first scan.
+        first: the first usable scan.
+        second: the next one.
     """
+    velocity = second.first_velocity
+    if velocity is not None:
+        state, output = stepper.step(stepper.init(first.before, velocity), first.scan, first.imu)
     if first.scan.duration == 0 or first.scan.points.shape != second.scan.points.shape:
-        return state
+        return state, output
     found, _ = stepper.step(state, second.scan, second.imu)
-    return stepper.step(stepper.init(first.before).with_velocity_of(found), first.scan, first.imu)[0]
+    opened = stepper.init(first.before, velocity).with_velocity_of(found)
+    return stepper.step(opened, first.scan, first.imu)
+
+
+def with_first_velocity(params: Any, velocity: NDArray[np.float64] | None) -> Any:
+    """Return params, or those of a transformed recipe, with another ``initial.velocity``.
+
+    Args:
+        params: a recipe's, those of a batch, or a :class:`Dual`.
+        velocity: (3,) m/s along the IMU's axes; None: the params stay.
+    """
+    if velocity is None:
+        return params
+    if isinstance(params, Dual):
+        return Dual(with_first_velocity(params.value, velocity), params.dot)
+    leaf = params.initial.velocity
+    return eqx.tree_at(
+        lambda one: one.initial.velocity,
+        params,
+        jnp.broadcast_to(jnp.asarray(velocity, leaf.dtype), leaf.shape),
+    )

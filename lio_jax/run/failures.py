@@ -101,6 +101,8 @@ class ScanEvidence:
 
     points: int
     """Number of points of the scan as it was recorded."""
+    covered: bool
+    """Whether something covers the sensor."""
     nav: Any
     """Navigation state, numpy leaves."""
     registration: Any
@@ -113,6 +115,8 @@ class ScanEvidence:
     """Time from the last scan's end to this scan's end, s; 0 for the first scan."""
     imu_gap_s: float | None
     """Longest time without an inertial sample since the last scan's end, s; None if no samples are used."""
+    new_piece: bool = False
+    """A new piece of map begins with the scan."""
     restarted: bool = False
     """The smoother ran away and began anew."""
     smoother_unfinished: bool = False
@@ -170,6 +174,8 @@ def _match_failure(now: ScanEvidence, settings: Settings) -> str:
     found = now.registration
     if now.points == 0:
         return "it holds no points; the pose is the prediction."
+    if now.covered:
+        return "nearly all its points are within 1 m: the sensor is covered; the pose is the prediction."
     if found.status == NOT_FINITE:
         return (
             f"the update was not finite ({_not_finite(found)}); state and covariance are the prediction's, "
@@ -179,10 +185,13 @@ def _match_failure(now: ScanEvidence, settings: Settings) -> str:
         needed = settings.values["registration"]["min_matches"]
         suspects = _suspects(now)
         why = f" ({', '.join(suspects)})" if suspects else ""
-        return (
-            f"{int(found.matches)} points matched the map, {needed:g} are needed{why}; "
-            "the pose is the prediction."
+        wanted = (
+            f"{needed:g} are needed"
+            if found.matches < needed
+            else "a quarter of all are needed after an outage"
         )
+        end = "; a new piece of map begins there." if now.new_piece else "."
+        return f"{int(found.matches)} points matched the map, {wanted}{why}; the pose is the prediction{end}"
     if found.status == ITERATION_LIMIT:
         limit = settings.config.registration.max_iterations
         if now.smoother_unfinished:

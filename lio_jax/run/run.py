@@ -24,6 +24,7 @@ from lio_jax.run.scan_inputs import OFFSET_MARGIN_S, ImuFeed
 from lio_jax.run.sinks import RunResult, Sink, finish_all
 from lio_jax.run.state_files import ImuRateFile, StateFiles
 from lio_jax.run.track import CompiledStep, ScanResult, track
+from lio_jax.run.verdict import Verdict
 from lio_jax.settings.settings import Settings, with_extrinsics
 
 
@@ -88,7 +89,7 @@ def run_sequence(
         imu, imu_notes = imu_feed(sequence, settings)
         log, times = TrajectoryLog(), StageTimes("decode", "pad", "step", "record", "total")
         # the log last: wherever Ctrl-C comes, the others have every scan that it has
-        everyone: list[Sink] = [times, Overflow(settings), Failures(start)]
+        everyone: list[Sink] = [times, Overflow(settings), Failures(start), Verdict(settings)]
         everyone += [ScanLog(out / "scans.npz", start), log]
         for sink in _result_files(sequence, settings, out, imu, log):
             stack.callback(sink.close)

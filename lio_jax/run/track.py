@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -14,9 +14,10 @@ from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.core.xla import programs
 from lio_jax.data.sequence import LidarScan
 from lio_jax.recipes.params import RecipeParams as Params
-from lio_jax.recipes.transforms import RecipeLike, Stepper, reopened
+from lio_jax.recipes.transforms import RecipeLike, Stepper, reopened, with_first_velocity
 from lio_jax.run.failures import ScanEvidence, failure_of, longest_gap
 from lio_jax.run.scan_inputs import ImuFeed, bucket_for, padded
+from lio_jax.run.shown_motion import MotionCheck, first_velocity
 from lio_jax.settings.settings import Settings, recipe_of
 
 
@@ -40,6 +41,9 @@ class ScanResult:
     """pad: copying into padded arrays; step: transfer, estimation and the way back; total: their sum."""
     failure: str
     """What went wrong with this scan, or nothing."""
+    motion_error: float | None = None
+    """Error of the motion since an earlier scan that the plan view shows, m; None where it was not
+    compared."""
     raw: NDArray[np.float32] | None = None
     """(k, 3) some of the points as recorded, m in the lidar frame of their own firing, for pictures."""
 
@@ -68,9 +72,14 @@ class Compiled:
         """Return the time spent on compiling since this was made, s."""
         return self._compiled_s() - self._compiled_before_s
 
-    def init(self, imu: ImuBatch | None) -> Any:
-        """Return the state before the first scan; ``imu``: samples up to its end, or None."""
-        return self.init_programs(self.params, imu)
+    def init(self, imu: ImuBatch | None, velocity: NDArray[np.float64] | None = None) -> Any:
+        """Return the state before the first scan.
+
+        Args:
+            imu: samples up to its end, or None.
+            velocity: (3,) replaces ``params.initial.velocity``, m/s; None: it holds.
+        """
+        return self.init_programs(with_first_velocity(self.params, velocity), imu)
 
     def step(self, state: Any, scan: Scan, imu: ImuBatch | None) -> tuple[Any, Any]:
         """Return state and output after a scan; ``state`` is consumed."""
@@ -120,6 +129,7 @@ class ResultBuilder:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._before: ScanEvidence | None = None
+        self._check = MotionCheck()
 
     def __call__(
         self, fed: "ScanInput", nav: Any, registration: Any, output: Any, step_ms: float
@@ -127,17 +137,20 @@ class ResultBuilder:
         """Return the result of a scan; ``nav`` and ``registration`` have numpy leaves."""
         evidence = ScanEvidence(
             points=fed.count,
+            covered=fed.covered,
             nav=nav,
             registration=registration,
             lost=bool(output.lost),
             nis=float(output.nis),
             since_last_s=float(fed.scan.interval),
+            new_piece=output.new_piece is not None and bool(output.new_piece),
             restarted=output.restarted is not None and bool(output.restarted),
             smoother_unfinished=output.smoother_unfinished is not None and bool(output.smoother_unfinished),
             imu_gap_s=_imu_gap(fed.imu, fed.scan, nav) if fed.imu else None,
         )
         failure = failure_of(evidence, self._before, self._settings)
         self._before = evidence
+        T_world_lidar = pose_matrix(registration.T_world_lidar.wxyz_xyz)
         return ScanResult(
             index=fed.index,
             stamp_ns=fed.end_ns,
@@ -147,6 +160,7 @@ class ResultBuilder:
             scan_points=fed.count,
             stage_ms={"pad": fed.pad_ms, "step": step_ms, "total": fed.pad_ms + step_ms},
             failure=failure,
+            motion_error=self._check(fed.index, fed.scan, T_world_lidar, evidence.lost or not fed.usable),
             raw=_some(np.asarray(fed.scan.points)[: fed.count]),
         )
 
@@ -159,10 +173,17 @@ class ScanInput:
     end_ns: int
     count: int
     """Points of the scan as it was recorded."""
+    covered: bool
+    """Whether something covers the sensor; the points are then masked."""
+    usable: bool
+    """Whether the scan can begin a map, or a map has begun before it."""
     scan: Scan
     imu: ImuBatch | None
     before: ImuBatch | None
-    """Samples up to this scan's end, for a start here; None after the first scan with points."""
+    """Samples up to this scan's end, for a start here; None after the first usable scan."""
+    first_velocity: NDArray[np.float64] | None
+    """(3,) velocity at the first scan's end that this second scan shows, m/s along the IMU's axes; None for
+    the other scans, and where the vehicle is slow or ``params.initial.velocity`` is not zero."""
     pad_ms: float
     padded_at: float
     """Host time, s."""
@@ -171,38 +192,99 @@ class ScanInput:
 def scan_inputs(settings: Settings, scans: Iterable[LidarScan], imu: ImuFeed | None) -> Iterator[ScanInput]:
     """Yield each scan in padded arrays, with the inertial samples that cover it."""
     last_end_ns, last_count, size = None, 0, 0
+    first: ScanInput | None = None
     opened = False
+    to_search = not any(settings.values["initial"]["velocity"])
+    R_imu_lidar = Rotation.from_quat(settings.values["extrinsics"]["rotation"])
     for index, scan in enumerate(scans):
         start = time.perf_counter()
         count = len(scan.points)
+        covered = is_covered(scan)
         # an empty or torn scan among whole ones is not worth compiling a program of its own size
         if count >= _STRAGGLER * last_count:
             size = bucket_for(count, settings.config.lidar)
         arrays = padded(scan, last_end_ns, settings.config.lidar, size)
         samples = imu.batch(scan, last_end_ns) if imu else None
-        before = imu.before(scan) if imu and not opened else None
-        opened = opened or count > 0
+        before = imu.before(scan) if imu and first is None else None
+        if covered:
+            nothing: Any = np.zeros(len(arrays.mask), np.bool_)
+            arrays = replace(arrays, mask=nothing)
+        usable = opened or sees_enough(arrays, settings)
+        velocity = None
+        if first is not None and not opened and usable and to_search:
+            interval = (scan.end_ns - first.end_ns) * 1e-9
+            velocity = first_velocity(first.scan, arrays, interval, first.before, samples, R_imu_lidar)
         done = time.perf_counter()
-        yield ScanInput(index, scan.end_ns, count, arrays, samples, before, (done - start) * 1e3, done)
+        fed = ScanInput(
+            index,
+            scan.end_ns,
+            count,
+            covered,
+            usable,
+            arrays,
+            samples,
+            before,
+            velocity,
+            (done - start) * 1e3,
+            done,
+        )
+        opened = first is not None
+        first = first or (fed if usable else None)
+        yield fed
         last_end_ns, last_count = scan.end_ns, count
 
 
+def is_covered(scan: LidarScan) -> bool:
+    """Return whether nearly all points are so near that something covers the sensor."""
+    some = scan.points[:: max(1, len(scan.points) // 1000)]
+    return len(some) > 0 and bool(np.mean(np.linalg.norm(some, axis=1) < COVERED_M) > _COVERED_SHARE)
+
+
+def sees_enough(scan: Scan, settings: Settings) -> bool:
+    """Return whether a scan has the points in range that a match needs; a blocked sensor has none."""
+    lidar, needed = settings.values["lidar"], settings.values["registration"]["min_matches"]
+    squared = np.einsum("ij,ij->i", scan.points, scan.points)
+    in_range = (squared > lidar["min_range"] ** 2) & (squared < lidar["max_range"] ** 2) & scan.mask
+    return int(np.count_nonzero(in_range)) >= needed
+
+
 def run_steps(stepper: Stepper, scan_inputs: Iterable[ScanInput]) -> Iterator[tuple[ScanInput, Any, Any]]:
-    """Yield each scan with the state and the output after it; the state is consumed by the next one."""
+    """Yield each scan with the state and the output after it; the state is consumed by the next one.
+
+    The first usable scan is yielded when the second one is there: only that shows how fast the vehicle
+    was.
+    """
     state: Any = None
-    first: ScanInput | None = None
+    held: tuple[ScanInput, Any, Any] | None = None
     opened = False
-    for fed in scan_inputs:
-        if state is None or (fed.count and first is None):
-            state = stepper.init(fed.before)
-        elif first is not None and fed.count and not opened:
-            state, opened = reopened(stepper, state, first, fed), True
-        if fed.count and first is None:
-            first = fed
-        state, output = stepper.step(state, fed.scan, fed.imu)
-        yield fed, state, output
+    try:
+        for fed in scan_inputs:
+            if held is not None:
+                first, state, output = held
+                held = None
+                if fed.usable:
+                    first = replace(first, padded_at=time.perf_counter())
+                    state, output = reopened(stepper, state, output, first, fed)
+                yield first, state, output
+                fed = replace(fed, padded_at=time.perf_counter())
+            begins = fed.usable and not opened
+            if state is None or begins:
+                state = stepper.init(fed.before)
+            state, output = stepper.step(state, fed.scan, fed.imu)
+            if begins:
+                held, opened = (fed, state, output), True
+            else:
+                yield fed, state, output
+    except Exception:
+        if held is not None:
+            yield held
+        raise
+    if held is not None:
+        yield held
 
 
+COVERED_M, _COVERED_SHARE = 1.0, 0.95
+"""A scan shows nothing but a cover if this share of its points is nearer than this distance, m."""
 _STRAGGLER = 0.25
 """A scan with less than this share of the points of the scan before keeps that one's padded size."""
 

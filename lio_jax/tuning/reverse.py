@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.core.xla import programs
 from lio_jax.recipes.params import RecipeParams as Params
-from lio_jax.recipes.transforms import RecipeLike, split_smooth
+from lio_jax.recipes.transforms import RecipeLike, split_smooth, with_first_velocity
 from lio_jax.run.track import run_steps
 from lio_jax.tuning.objectives import Objective, Observed, Observing, TruePose
 from lio_jax.tuning.parameters import ParameterVector
@@ -75,6 +75,8 @@ class _Operation:
     """Numbers of the states it was given: none for a first state, two for a velocity handed over."""
     scan: Scan | None = None
     imu: ImuBatch | None = None
+    velocity: NDArray[np.float64] | None = None
+    """Of a first state: replaces that of the params."""
     sums: Any = None
     """The objective's sums before."""
     truth: TruePose | None = None
@@ -121,9 +123,14 @@ class _Tape:
         self._kept: dict[int, Any] = {}
         self._sums = objective.start()
 
-    def init(self, imu: ImuBatch | None) -> _Taped:
-        """Return the state before the first scan; ``imu``: samples up to its end, or None."""
-        return self._noted(_Operation((), imu=imu), ())[0]
+    def init(self, imu: ImuBatch | None, velocity: NDArray[np.float64] | None = None) -> _Taped:
+        """Return the state before the first scan.
+
+        Args:
+            imu: samples up to its end, or None.
+            velocity: (3,) replaces ``params.initial.velocity``, m/s; None: it holds.
+        """
+        return self._noted(_Operation((), imu=imu, velocity=velocity), ())[0]
 
     def step(self, state: _Taped, scan: Scan, imu: ImuBatch | None) -> tuple[_Taped, Observed]:
         """Return the state after a scan and what it leaves to see."""
@@ -131,7 +138,7 @@ class _Tape:
         # what comes after a step needs no state before it
         if number - max(self._kept) >= self._every:
             self._kept[number] = state.state
-        return self._noted(_Operation((state.number,), scan, imu, self._sums), (state.state,))
+        return self._noted(_Operation((state.number,), scan, imu, sums=self._sums), (state.state,))
 
     def handed_over(self, first: _Taped, found: _Taped) -> _Taped:
         """Return a first state with the velocity that a later state found."""
@@ -183,7 +190,7 @@ class _Tape:
         if given:
             first, found = given
             return first.with_velocity_of(found), None
-        return self._init(params, operation.imu), None
+        return self._init(with_first_velocity(params, operation.velocity), operation.imu), None
 
     def _pulled(
         self, operation: _Operation, given: tuple[Any, ...], bar: Any, sums_bar: Any
@@ -197,7 +204,9 @@ class _Tape:
             first, found = given
             none = jax.tree.map(jnp.zeros_like, self._params[0])
             return none, _pull_velocity(first, found, bar), sums_bar
-        return self._pull_init(self._params, operation.imu, bar), (), sums_bar
+        tuned, others = self._params
+        others = with_first_velocity(others, operation.velocity)
+        return self._pull_init((tuned, others), operation.imu, bar), (), sums_bar
 
 
 def _pull_params(free: ParameterVector, x: Array, bar: Params) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 from lio_jax.core.errors import UsageError
 from lio_jax.core.files import atomic_path
 from lio_jax.evaluation.trajectory_error import position_errors
+from lio_jax.run.verdict import in_words
 from lio_jax.viz import run_figures
 from lio_jax.viz.html import bullets, figure, figures, folded, page, paragraph, section, table, tiles
 from lio_jax.viz.run_figures import relative_error_groups, way_of
@@ -98,6 +99,8 @@ def headline(run: RunRecord) -> dict[str, str]:
     ):
         if key in metrics:
             values[name] = f"{metrics[key]:.{0 if unit == 'MiB' else 1}f} {unit}"
+    if "verdict" in metrics:
+        values["verdict"] = in_words(metrics["verdict"])
     values["failed scans"] = str(len(metrics.get("failures", [])))
     return values
 
@@ -113,7 +116,8 @@ def _complaints(run: RunRecord) -> list[str]:
     metrics = run.metrics
     failures = [failure["message"] for failure in metrics.get("failures", [])]
     hidden = len(failures) - _FAILURES_SHOWN
-    messages = [*metrics.get("warnings", []), *run.remarks, *failures[:_FAILURES_SHOWN]]
+    reasons = metrics.get("verdict", {}).get("reasons", [])
+    messages = [*reasons, *metrics.get("warnings", []), *run.remarks, *failures[:_FAILURES_SHOWN]]
     if hidden > 0:
         messages.append(f"{hidden} more failed scans; metrics.json lists them all.")
     return [bullets(messages, bad=True) or paragraph("None.")]
@@ -273,5 +277,9 @@ def _complaints_of(names: list[str], runs: Sequence[RunRecord]) -> list[str]:
     for name, run in zip(names, runs, strict=True):
         failures = len(run.metrics.get("failures", []))
         messages += [f"{name}: {failures} failed scans"] * (failures > 0)
-        messages += [f"{name}: {sentence}" for sentence in (*run.metrics.get("warnings", []), *run.remarks)]
+        verdict = run.metrics.get("verdict", {})
+        if verdict.get("state", "sound") != "sound":
+            messages.append(f"{name}: {in_words(verdict)}")
+        sentences = (*verdict.get("reasons", []), *run.metrics.get("warnings", []), *run.remarks)
+        messages += [f"{name}: {sentence}" for sentence in sentences]
     return [bullets(messages, bad=True) or paragraph("None.")]

@@ -2,7 +2,7 @@
 
 import json
 
-from lio_jax.commands import demo
+from lio_jax.commands import sim
 from lio_jax.sim.sequence import SimulatedSequence
 from tests.commands.conftest import PLAIN
 from tests.commands.test_run_folder import FILES
@@ -12,7 +12,7 @@ def test_demo(cli, tmp_path, monkeypatch):
     def shorter(**words):
         return SimulatedSequence(**{**words, "beams": 16, "columns": 512, "duration_s": 4.2, "seed": 1})
 
-    monkeypatch.setattr(demo, "SimulatedSequence", shorter)
+    monkeypatch.setattr(sim, "SimulatedSequence", shorter)
     done = cli("demo", "--out", tmp_path / "demo")
     assert done.status == 0, done.err
     assert {entry.name for entry in (tmp_path / "demo").iterdir()} == FILES | {"imu_rate.tum"}

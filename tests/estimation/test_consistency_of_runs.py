@@ -18,7 +18,7 @@ from lio_jax.core.error_state import (
     VELOCITY,
 )
 from lio_jax.core.types import CONVERGED
-from lio_jax.evaluation.consistency import average_band, nees
+from lio_jax.evaluation.trajectory_error import average_band, nees
 from tests.estimation import wave
 
 pytestmark = pytest.mark.long

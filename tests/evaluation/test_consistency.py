@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from lio_jax.core.errors import UsageError
-from lio_jax.evaluation.consistency import average_band, nees
+from lio_jax.evaluation.trajectory_error import average_band, nees
 
 
 def test_nees_is_the_squared_mahalanobis_distance() -> None:

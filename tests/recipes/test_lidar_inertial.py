@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.error_state import EXTRINSIC_ROTATION, EXTRINSIC_TRANSLATION, TIME_OFFSET
-from lio_jax.evaluation.consistency import nees
+from lio_jax.evaluation.trajectory_error import nees
 from lio_jax.recipes.default import Default
 from lio_jax.run.run import settings_for
 from lio_jax.run.scan_inputs import OFFSET_MARGIN_S, ImuFeed

@@ -197,7 +197,7 @@ def test_two_scans_of_one_instant_change_nothing():
 
 def test_a_runaway_bias_starts_the_smoother_anew():
     def shaken(number, scan, imu):
-        wild = replace(imu, accel=imu.accel + 300.0)
+        wild = replace(imu, accel=imu.accel + 700.0)
         return scan, wild if number == MOVING else imu
 
     states, outputs, poses = run(change=shaken)
@@ -210,7 +210,7 @@ def test_a_runaway_bias_starts_the_smoother_anew():
     restarted = [bool(output.restarted) for output in outputs]
     assert restarted.index(True) >= MOVING
     assert not outputs[restarted.index(True)].added.any()
-    # the wild samples foretell 1.5 m, and a match that begins there ends elsewhere
+    # the wild samples foretell 3.5 m, and a match that begins there ends elsewhere
     assert ate(poses) < 0.03
     for output in outputs:
         assert np.isfinite(np.asarray(output.covariance)).all()
@@ -271,7 +271,7 @@ def test_ground_that_the_map_does_not_hold_is_mapped_after_a_while():
         poses.append(np.asarray(state.nav.T_world_imu.as_matrix()))
     again = added.index(True, MOVING)
     assert all(lost[MOVING : again + 1])
-    assert again - (MOVING - 1) > 10 * DEFAULTS["limits"]["outage"]
+    assert again - (MOVING - 1) >= 10 * DEFAULTS["limits"]["outage"]
     assert not any(lost[again + 1 :])
     assert again < SCANS - 3
     assert ate(np.stack(poses)) < 0.1

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.types import CONVERGED, LOST, ImuBatch, Scan, initial_nav_state
+from lio_jax.estimation.map_drift import MapDrift
 from lio_jax.lidar.features import FeatureCloud
 from lio_jax.mapping.feature_map import FeaturePoints, Submap, empty_feature_map
 from lio_jax.mapping.keyframes import no_keyframes
@@ -57,6 +58,7 @@ def state(T_world_imu=None, velocity=SPEED, scans=5, time=1.0, matched_at=0.9) -
         time=jnp.asarray(time),
         matched_at=jnp.asarray(matched_at),
         scans=jnp.int32(scans),
+        drift=MapDrift.none(jnp.dtype(jnp.float64)),
         map=Submap(keyframes, empty_feature_map(CONFIG.map.capacity)),
     )
 
@@ -116,7 +118,7 @@ def features(enough=True, seen=True) -> Features:
     return Features(cloud(CORNERS), cloud(SURFACES), jnp.array(enough), jnp.array(seen), none)
 
 
-def match(T_world_imu, used=True, lost=False) -> MapMatch:
+def match(T_world_imu, used=True, lost=False, new_piece=False) -> MapMatch:
     registration = Registration(
         T_world_lidar=T_world_imu,
         information=1e4 * jnp.eye(6),
@@ -126,7 +128,7 @@ def match(T_world_imu, used=True, lost=False) -> MapMatch:
         iterations=jnp.int32(3),
         status=jnp.int32(LOST if lost else CONVERGED),
     )
-    return MapMatch(registration, T_world_imu, jnp.array(used), jnp.array(lost))
+    return MapMatch(registration, T_world_imu, *map(jnp.array, (used, lost, new_piece)))
 
 
 def mapped(T_world_lidar=None) -> LioSamState:
@@ -336,9 +338,18 @@ def test_an_unused_match_or_a_failure_makes_no_keyframe(with_map):
 
 def test_a_lost_scan_begins_a_new_piece_of_map_after_an_outage(with_map):
     T = FIRST_KEYFRAME @ pose([2.0, 0.0, 0.0])
-    lost, outage = match(T, used=False, lost=True), float(PARAMS.limits.outage)
-    since = float(with_map.matched_at)
-    soon, late = clock(time=since + 0.9 * outage), clock(time=since + 1.1 * outage)
-    assert added_at(with_map, T, lost, now=soon) == 1
-    assert added_at(with_map, T, lost, now=late) == 2
-    assert added_at(with_map, T, lost, now=late, enough=False) == 1
+    assert added_at(with_map, T, match(T, used=False, lost=True)) == 1
+    assert added_at(with_map, T, match(T, used=False, lost=True, new_piece=True)) == 2
+
+
+def test_a_new_piece_of_map_waits_for_an_outage_and_needs_features(with_map):
+    since, outage = float(with_map.matched_at), float(PARAMS.limits.outage)
+    away = pose([60.0, 0.0, 0.0])
+
+    def seen(share, enough=True):
+        return matched_from(with_map, TRUTH, away, time=since + share * outage, enough=enough)
+
+    assert bool(seen(0.9).lost)
+    assert not bool(seen(0.9).new_piece)
+    assert bool(seen(1.1).new_piece)
+    assert not bool(seen(1.1, enough=False).new_piece)

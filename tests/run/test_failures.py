@@ -49,6 +49,7 @@ def match(missing: tuple[np.ndarray, ...] = (), rotation: Rotation = UNTURNED, *
 def evidence(**fields) -> ScanEvidence:
     usual = ScanEvidence(
         points=1000,
+        covered=False,
         nav=nav(),
         registration=match(),
         lost=False,
@@ -121,13 +122,13 @@ def test_an_outage_of_both_is_bridged_by_constant_velocity() -> None:
     assert "constant velocity predicted" in said(since_last_s=5.1, imu_gap_s=5.0)
 
 
-FAST = nav(velocity=[0.0, 24.0, 32.0])
+FAST = nav(velocity=[0.0, 48.0, 64.0])
 
 
 def test_speed_beyond_the_limit_is_said_once() -> None:
-    assert said(nav=FAST).startswith("the speed reached 40 m/s, above params.limits.speed=30: ")
+    assert said(nav=FAST).startswith("the speed reached 80 m/s, above params.limits.speed=60: ")
     assert said(evidence(nav=FAST), nav=FAST) == ""
-    assert said(settings=with_overrides(SETTINGS, ["params.limits.speed=50"]), nav=FAST) == ""
+    assert said(settings=with_overrides(SETTINGS, ["params.limits.speed=90"]), nav=FAST) == ""
 
 
 @pytest.mark.parametrize(

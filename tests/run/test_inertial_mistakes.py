@@ -220,15 +220,15 @@ def test_five_seconds_without_lidar_are_predicted_and_recovered_from(replayed: R
 def test_a_force_that_is_not_there_names_speed_and_cause(replayed: Replayer) -> None:
     """The scans end, the samples go on with a force that is not there."""
     pushed = imu().accel.copy()
-    pushed[seconds() > 3.0] += [15.0, 0.0, 0.0]
+    pushed[seconds() > 3.0] += [30.0, 0.0, 0.0]
     empty = [replace(without_points(scans()[-1]), stamp_ns=s) for s in _stamps(END, END + 30)]
     seen = replayed([*scans(), *empty], changed(accel=pushed))
     fast = [index for index, said in seen.failures.items() if "params.limits.speed" in said]
     speeds = [float(np.linalg.norm(item.nav.velocity)) for item in seen.tracked]
     assert len(fast) == 1
-    assert speeds[fast[0] - 1] <= 30 < speeds[fast[0]]
+    assert speeds[fast[0] - 1] <= 60 < speeds[fast[0]]
     assert re.search(
-        r"The speed reached 3\d\.\d m/s, above params\.limits\.speed=30: "
+        r"The speed reached 6\d\.\d m/s, above params\.limits\.speed=60: "
         r"likely because the scan was not matched\.",
         seen.failures[fast[0]],
     )

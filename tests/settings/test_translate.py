@@ -135,7 +135,8 @@ def test_fast_lio2s_values_for_ros2():
     settings = resolved(FAST_LIO2_ROS2)
     own = recipe_settings("fast_lio2")
     for section in ("imu", "initial", "map", "registration", "point_map"):
-        assert settings.values[section] == pytest.approx(own.values[section], rel=1e-12), section
+        for name, value in own.values[section].items():
+            assert settings.values[section][name] == pytest.approx(value, rel=1e-12), (section, name)
     assert settings.run.data.time_unit == "ns"
     assert settings.config.fast_lio2.point_filter_num == 3
     assert settings.config.registration.max_iterations == own.config.registration.max_iterations

@@ -78,7 +78,7 @@ class Recording:
                 duration=np.float64(0.1),
                 interval=np.float64(0.1),
             )
-            yield ScanInput(index, index, count, scan, None, None, 0.0, 0.0)
+            yield ScanInput(index, index, count, False, count > 0, scan, None, None, None, 0.0, 0.0)
 
     def truth_at(self, end_ns):
         return TruePose(jaxlie.SE3.identity(), jnp.array(False))

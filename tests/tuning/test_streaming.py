@@ -79,8 +79,8 @@ class HeldMap:
         self.replayed = maps is not None
         self.count = 0
 
-    def init(self, imu):
-        return self.own.init(imu)
+    def init(self, imu, velocity=None):
+        return self.own.init(imu, velocity)
 
     def step(self, state, scan, imu):
         if not self.replayed:

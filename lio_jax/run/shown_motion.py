@@ -1,0 +1,198 @@
+"""The motion that plan views show, beside the scan match: at the start, and as a check of the estimate.
+
+A scan match that starts from rest may stay there: the scan lines on the ground fit best where the sensor has
+not moved. The plan view of what stands upright shows how far the vehicle went, at any speed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from lio_jax.core.types import ImuBatch, Scan
+from lio_jax.lidar.plan_view import Displacement, PlanView, displacement, plan_view
+
+_FASTEST = 45.0
+"""Largest speed that is tried, m/s."""
+_SLOWEST = 2.0
+"""Below this speed a scan match finds the velocity from rest, m/s."""
+_LONGEST_INTERVAL = 0.5
+"""Longest time between the two scans, s."""
+_TURNS = np.arange(-10, 11) * 0.01
+"""Turns about the vertical between the two scans that are tried where no gyroscope shows the turn, rad."""
+_COARSELY = 250
+"""Number of cells with which these turns are compared."""
+_PIECES = 20
+"""Number of pieces into which the time between the scans is cut to integrate the angular rate."""
+
+
+def first_velocity(
+    first: Scan,
+    second: Scan,
+    interval: float,
+    before: ImuBatch | None,
+    between: ImuBatch | None,
+    R_imu_lidar: Rotation,
+) -> NDArray[np.float64] | None:
+    """Return the lidar's velocity at the first scan's end, (3,) m/s along the IMU's axes, to about 1 m/s.
+
+    None: the vehicle is slower than 2 m/s, or the scans do not show a speed without doubt.
+
+    Args:
+        first: padded, numpy leaves.
+        second: the next one with points.
+        interval: time between the ends of the two, s.
+        before: samples up to the first scan's end, which show the vertical; None: it is the lidar's z axis.
+        between: samples between the scans' ends, which show the turn; None: it is searched.
+        R_imu_lidar: rotation of the lidar in the IMU frame.
+    """
+    if not 0 < interval <= _LONGEST_INTERVAL:
+        return None
+    clouds = _points(first), _points(second)
+    level, view = _levelled(clouds[0], before, R_imu_lidar)
+    measured = _turn(between, float(second.duration), interval)
+    turn = R_imu_lidar.inv() * (measured or Rotation.identity()) * R_imu_lidar
+    seen = plan_view(_turned(clouds[1], level * turn))
+    if measured is None:
+        angle = max(_TURNS, key=lambda angle: _compared(view, seen, angle, interval, _COARSELY).votes)
+        turn = level.inv() * Rotation.from_rotvec([0.0, 0.0, angle]) * level
+    else:
+        angle = 0.0
+    found = _compared(view, seen, angle, interval)
+    if not found.is_certain:
+        return None
+    # the velocity stays in the body's own axes: the way points along the mean heading
+    half = Rotation.from_rotvec(turn.as_rotvec() / 2)
+    way = half.inv().apply(level.inv().apply([*found.shift, 0.0]))
+    velocity: NDArray[np.float64] = R_imu_lidar.apply(way) / interval
+    return velocity if np.linalg.norm(velocity) > _SLOWEST else None
+
+
+def _points(scan: Scan) -> NDArray[np.float32]:
+    points = np.asarray(scan.points)[np.asarray(scan.mask)]
+    return points[np.isfinite(points).all(axis=1)]
+
+
+def _levelled(
+    points: NDArray[np.float32], before: ImuBatch | None, R_imu_lidar: Rotation
+) -> tuple[Rotation, PlanView]:
+    """Return the rotation from the lidar frame to level axes, and the plan view in them.
+
+    In a bend the accelerometer's mean does not point up, and a lidar may be mounted tilted. Of both
+    directions that one is vertical in which less stands upright.
+    """
+    directions = [np.array([0.0, 0.0, 1.0])]
+    if before is not None and np.any(before.mask):
+        directions.append(
+            R_imu_lidar.inv().apply(np.asarray(before.accel)[np.asarray(before.mask)].mean(axis=0))
+        )
+    levels = [Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0] for up in directions if np.any(up)]
+    views = [(level, plan_view(_turned(points, level))) for level in levels]
+    return min(views, key=lambda one: len(one[1].centers))
+
+
+def _turn(between: ImuBatch | None, end: float, interval: float) -> Rotation | None:
+    """Return the rotation between two scans' ends, in the IMU frame; None without samples.
+
+    Args:
+        between: samples between the two.
+        end: the second end on the samples' clock, s.
+        interval: time between the two, s.
+    """
+    if between is None or not np.any(between.mask):
+        return None
+    mask = np.asarray(between.mask)
+    time, rate = np.asarray(between.time)[mask], np.asarray(between.gyro)[mask]
+    edges = np.linspace(end - interval, end, _PIECES + 1)
+    turn = Rotation.identity()
+    for middle, length in zip((edges[1:] + edges[:-1]) / 2, np.diff(edges), strict=True):
+        turn = turn * Rotation.from_rotvec([length * np.interp(middle, time, axis) for axis in rate.T])
+    return turn
+
+
+def _compared(
+    view: PlanView, seen: PlanView, angle: float, interval: float, most: int | None = None
+) -> Displacement:
+    """Return the displacement between two views, the second one turned; at most ``most`` cells are used."""
+    centers = seen.turned(angle)
+    every = 1 if most is None else -(-max(len(centers), 1) // most)
+    return displacement(view, centers[::every], _FASTEST * interval)
+
+
+def _turned(points: NDArray[np.float32], rotation: Rotation) -> NDArray[np.float32]:
+    return points @ rotation.as_matrix().T.astype(np.float32)
+
+
+_AFTER = (1, 3, 9)
+"""Numbers of scans after a reference at which the motion since then is compared."""
+_EVERY = 100
+"""Number of scans from one reference to the next."""
+_REACH = 5.0
+"""Largest error that is searched, m."""
+_STEP = 0.5
+"""Distance between two errors that are tried, m."""
+_POINTS = 40_000
+"""A scan with more points is thinned to about so many."""
+
+
+@dataclass(frozen=True)
+class _Reference:
+    index: int
+    view: PlanView
+    T_world_lidar: NDArray[np.float64]
+
+
+class MotionCheck:
+    """Compares the estimated motion with the plan views of single scans."""
+
+    def __init__(self) -> None:
+        self._reference: _Reference | None = None
+        self._next = 0
+
+    def __call__(
+        self, index: int, scan: Scan, T_world_lidar: NDArray[np.float64], lost: bool
+    ) -> float | None:
+        """Return the error of the motion since the reference, m; None where nothing was compared.
+
+        Args:
+            index: number of the scan.
+            scan: padded, numpy leaves.
+            T_world_lidar: (4, 4) estimated pose.
+            lost: the scan was not matched.
+        """
+        if lost:
+            # the next matched scan is compared with the one after it
+            self._reference, self._next = None, index + 1
+            return None
+        reference, error = self._reference, None
+        since = index - reference.index if reference else 0
+        if index < self._next and since not in _AFTER:
+            return None
+        view = _view(scan, T_world_lidar)
+        if reference is not None and since in _AFTER:
+            error = _error(reference, view, T_world_lidar)
+        if index >= self._next:
+            self._reference, self._next = _Reference(index, view, T_world_lidar), index + _EVERY
+        return error
+
+
+def _view(scan: Scan, T_world_lidar: NDArray[np.float64]) -> PlanView:
+    points = np.asarray(scan.points)[np.asarray(scan.mask)]
+    points = points[:: max(1, len(points) // _POINTS)]
+    points = points[np.isfinite(points).all(axis=1)]
+    return plan_view(points @ T_world_lidar[:3, :3].T.astype(np.float32))
+
+
+def _error(reference: _Reference, view: PlanView, T_world_lidar: NDArray[np.float64]) -> float | None:
+    """Return the distance of the displacement that the views show from the estimated one, m; None: no
+    telling."""
+    moved = (T_world_lidar - reference.T_world_lidar)[:2, 3]
+    if np.linalg.norm(moved) > _FAR:
+        return None
+    found = displacement(reference.view, view.centers + moved.astype(np.float32), _REACH, _STEP)
+    return float(np.linalg.norm(found.shift)) if found.is_certain else None
+
+
+_FAR = 15.0
+"""Motion beyond which two views have too little in common, m."""

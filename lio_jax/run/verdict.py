@@ -1,0 +1,182 @@
+"""The judgement on a whole run: sound, doubtful from an instant on, or lost from an instant on."""
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.types import CONVERGED, ITERATION_LIMIT
+from lio_jax.run.sinks import RunResult, Sink
+from lio_jax.run.track import ScanResult
+from lio_jax.settings.settings import Settings
+
+TOLERATED_M, TOLERATED_SHARE = 1.0, 0.05
+"""An error above this distance, m, or above this share of the way, makes a trajectory doubtful."""
+_CONTRADICTED_M = 1.2
+"""Error of the motion against the plan view that counts, m: the plan view is never wrong by this when it is
+certain."""
+_WINDOW = 20
+"""Number of scans over which convergence and the normalised innovation are averaged."""
+_UNCONVERGED = 0.5
+"""Share of the window's scans that may end without convergence."""
+_LARGEST_NIS = 25.0
+"""Largest mean of the normalised innovation per degree of freedom over the window; 1 is expected."""
+_LOST_S = 1.0
+"""Time without a match at the end of a run from which it ends lost, s."""
+_UNOBSERVED_M = 20.0
+"""Way with an unobserved direction of motion that is tolerated where no inertial samples bridge it, m."""
+
+
+@dataclass
+class _Evidence:
+    """What is summed over the scans."""
+
+    way: float = 0.0
+    unmatched_since_s: float | None = None
+    unobserved_m: float = 0.0
+    contradictions: int = 0
+    unconverged: deque[bool] = field(default_factory=lambda: deque(maxlen=_WINDOW))
+    nis: deque[float] = field(default_factory=lambda: deque(maxlen=_WINDOW))
+
+
+class Verdict(Sink):
+    """Judges a run from its scans."""
+
+    def __init__(self, settings: Settings) -> None:
+        """Begin without evidence; ``settings``: of the run."""
+        self._outage_s = settings.values["limits"]["outage"]
+        self._seen = _Evidence()
+        self._first_ns: int | None = None
+        self._before: ScanResult | None = None
+        self._reasons: dict[str, tuple[float, str]] = {}
+        self._now_s = 0.0
+
+    def take(self, result: ScanResult) -> None:
+        """Add the evidence of one scan."""
+        if self._first_ns is None:
+            self._first_ns = result.stamp_ns
+        self._now_s = (result.stamp_ns - self._first_ns) * 1e-9
+        step = 0.0
+        if self._before is not None:
+            step = float(np.linalg.norm(result.T_world_imu[:3, 3] - self._before.T_world_imu[:3, 3]))
+        self._seen.way += step
+        self._note_outage(result)
+        self._note_motion(result)
+        self._note_window(result)
+        self._note_unobserved(result, step)
+        self._before = result
+
+    def finish(self, run: RunResult) -> None:
+        """Hand over the verdict."""
+        run.metrics["verdict"] = self.verdict()
+
+    def verdict(self) -> dict[str, Any]:
+        """Return state, the time since the first scan from which it holds (s), and the reasons."""
+        reasons = dict(self._reasons)
+        since, state = self._seen.unmatched_since_s, "doubtful" if reasons else "sound"
+        if since is not None and self._now_s - since >= _LOST_S:
+            state = "lost"
+            reasons["lost"] = since, f"from {since:.1f} s on no scan was matched"
+        elif self._seen.contradictions > 1:
+            state = "lost"
+        if state == "lost" and self._seen.contradictions > 1:
+            since = reasons["motion"][0]
+        elif reasons and state == "doubtful":
+            since = min(time for time, _ in reasons.values())
+        ordered = sorted(reasons.values())
+        return {
+            "state": state,
+            "since_s": None if state == "sound" or since is None else round(float(since), 3),
+            "reasons": [f"{words}." for _, words in ordered],
+        }
+
+    def _doubt(self, kind: str, words: str, since_s: float | None = None) -> None:
+        self._reasons.setdefault(kind, (self._now_s if since_s is None else since_s, words))
+
+    def _note_outage(self, result: ScanResult) -> None:
+        output, before = result.output, self._before
+        lost = bool(output.lost)
+        unmatched = self._seen.unmatched_since_s
+        if lost and unmatched is None and before is not None:
+            unmatched = (before.stamp_ns - (self._first_ns or 0)) * 1e-9
+        if output.new_piece is not None and bool(output.new_piece):
+            assert unmatched is not None
+            gap = self._now_s - unmatched
+            sigma = _sigma(output.covariance)
+            speed = float(np.linalg.norm(before.nav.velocity)) if before is not None else 0.0
+            error = gap * speed if sigma is None else sigma
+            if error > TOLERATED_M or error > TOLERATED_SHARE * self._seen.way:
+                known = (
+                    "its error is unknown" if sigma is None else f"its standard deviation is {sigma:.1f} m"
+                )
+                self._doubt(
+                    "outage",
+                    f"no scan was matched for {gap:.1f} s up to {self._now_s:.1f} s; the map goes on from "
+                    f"the predicted pose, and {known}",
+                    unmatched,
+                )
+            lost = False
+        self._seen.unmatched_since_s = unmatched if lost else None
+
+    def _note_motion(self, result: ScanResult) -> None:
+        if result.motion_error is None:
+            return
+        if result.motion_error > _CONTRADICTED_M:
+            self._seen.contradictions += 1
+            self._doubt(
+                "motion",
+                f"at {self._now_s:.1f} s walls and poles show another motion than the estimated one, by "
+                f"{result.motion_error:.1f} m: the scan match follows the scan lines, or the map is wrong",
+            )
+
+    def _note_window(self, result: ScanResult) -> None:
+        output, seen = result.output, self._seen
+        seen.unconverged.append(int(output.registration.status) == ITERATION_LIMIT)
+        if len(seen.unconverged) == _WINDOW and np.mean(seen.unconverged) > _UNCONVERGED:
+            self._doubt(
+                "convergence", f"more than half of the scans around {self._now_s:.1f} s did not converge"
+            )
+        freedom = int(output.nis_dof)
+        if freedom and int(output.registration.status) == CONVERGED:
+            seen.nis.append(float(output.nis) / freedom)
+        if len(seen.nis) == _WINDOW and (mean := float(np.mean(seen.nis))) > _LARGEST_NIS:
+            self._doubt(
+                "innovation",
+                f"around {self._now_s:.1f} s the scans contradict the prediction by inertial samples "
+                f"(normalised innovation {mean:.0f} times what is expected)",
+            )
+        sigma = _sigma(output.covariance)
+        if sigma is not None and sigma > max(TOLERATED_M, TOLERATED_SHARE * seen.way):
+            self._doubt("covariance", f"the position's standard deviation reached {sigma:.1f} m")
+        if output.restarted is not None and bool(output.restarted):
+            self._doubt("restart", f"at {self._now_s:.1f} s velocity or biases ran away and began anew")
+
+    def _note_unobserved(self, result: ScanResult, step: float) -> None:
+        output = result.output
+        bridged = output.covariance is not None
+        weak = bool(np.any(output.registration.degenerate)) and not bool(output.lost)
+        self._seen.unobserved_m = self._seen.unobserved_m + step if weak and not bridged else 0.0
+        if self._seen.unobserved_m > max(_UNOBSERVED_M, TOLERATED_SHARE * self._seen.way):
+            self._doubt(
+                "unobserved",
+                f"up to {self._now_s:.1f} s the scene left a direction unobserved over "
+                f"{self._seen.unobserved_m:.0f} m",
+            )
+
+
+def in_words(verdict: dict[str, Any]) -> str:
+    """Return a verdict of metrics.json in a few words."""
+    since = verdict["since_s"]
+    return verdict["state"] + (f" from {since:.1f} s on" if since is not None else "")
+
+
+def _sigma(covariance: NDArray[np.float64] | None) -> float | None:
+    """Return the largest standard deviation of the position over all directions, m."""
+    if covariance is None:
+        return None
+    position = np.asarray(covariance)[3:6, 3:6]
+    return (
+        float(np.sqrt(max(np.linalg.eigvalsh(position)[-1], 0.0))) if np.isfinite(position).all() else np.inf
+    )

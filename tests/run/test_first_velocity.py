@@ -1,0 +1,60 @@
+"""Every recipe finds its velocity from the first scans, at any speed."""
+
+import numpy as np
+import pytest
+
+from lio_jax.data.detect import open_sequence
+from lio_jax.run.track import scan_inputs
+from lio_jax.settings.settings import Settings, with_overrides
+from tests.run.roads import relative, road, steps, tracked
+from tests.shared_data import SHARED_DATA, needs_shared
+
+DRIVE = SHARED_DATA / "kitti_raw" / "2011_09_26" / "2011_09_26_drive_0015_sync"
+WITHOUT = ("config.imu.use=false",)
+CASES = [("default", ()), ("default", WITHOUT), ("fast_lio2", ()), ("lio_sam", ()), ("loam", ())]
+
+
+@needs_shared
+@pytest.mark.parametrize(("recipe", "overrides"), CASES)
+def test_a_real_drive_at_17_metres_a_second_is_followed_from_the_first_scan(recipe, overrides):
+    sequence = open_sequence(DRIVE)
+    _, results = tracked(sequence, recipe, overrides, scans=sequence.scans(0, 20))
+    poses, truth = relative(results, sequence)
+    assert steps(truth).min() > 1.6
+    # the stamps of this drive's poses jitter by 10 ms: over three scans the speeds compare
+    np.testing.assert_allclose(steps(poses)[:3].sum(), steps(truth)[:3].sum(), rtol=0.05)
+    np.testing.assert_allclose(steps(poses).sum(), steps(truth).sum(), rtol=0.03)
+
+
+@pytest.mark.parametrize(("recipe", "overrides"), CASES)
+@pytest.mark.parametrize(("speed", "turn"), [(35.0, 0.5)])
+def test_a_simulated_street_is_followed_at_any_speed(recipe, overrides, speed, turn):
+    sequence = road("street", speed, turn, 8)
+    _, results = tracked(sequence, recipe, overrides)
+    poses, truth = relative(results, sequence)
+    np.testing.assert_allclose(steps(poses)[2:], steps(truth)[2:], rtol=0.05)
+    assert np.linalg.norm(poses[-1, :3, 3] - truth[-1, :3, 3]) < 0.05 * steps(truth).sum()
+
+
+@pytest.mark.parametrize("imu", [True, False])
+def test_the_first_velocity_is_found_on_a_motorway_where_nearly_all_points_lie_on_the_ground(imu):
+    sequence = road("motorway", 35.0, 0.5, 8, imu=imu)
+    _, second = list(scan_inputs(Settings(), sequence.scans(0, 2), None))
+    assert second.first_velocity is not None
+    # the lidar's own axes: it is mounted with a yaw of 2.5 degrees
+    assert np.linalg.norm(second.first_velocity) == pytest.approx(35.0, rel=0.1)
+
+
+def test_a_velocity_of_the_settings_is_taken_as_it_is():
+    sequence = road("street", 25.0, 0.0, 8)
+    given = with_overrides(Settings(), ["params.initial.velocity=[24.0,0,0]"])
+    assert all(fed.first_velocity is None for fed in scan_inputs(given, sequence.scans(0, 3), None))
+    _, results = tracked(sequence, "default", ["params.initial.velocity=[24.0,0,0]"])
+    poses, truth = relative(results, sequence)
+    np.testing.assert_allclose(steps(poses)[2:], steps(truth)[2:], rtol=0.05)
+
+
+def test_the_state_of_the_first_scan_has_the_velocity_that_the_second_one_shows():
+    sequence = road("street", 25.0, 0.0, 8)
+    _, results = tracked(sequence, "default")
+    assert np.linalg.norm(results[0].nav.velocity) == pytest.approx(25.0, rel=0.05)

@@ -1,0 +1,58 @@
+"""A run ends with a verdict: sound, doubtful or lost, with the reason."""
+
+import json
+
+import pytest
+
+from lio_jax.cli import main
+from lio_jax.data.detect import open_sequence
+from lio_jax.run.verdict import Verdict, in_words
+from tests.run.roads import relative, road, steps, tracked
+from tests.run.test_first_velocity import DRIVE
+from tests.shared_data import needs_shared
+
+AT_REST = "params.initial.velocity=[0,0,0.001]"
+"""Forbids the search for the first velocity, so that the scan match stays where it starts: at rest."""
+
+
+def verdict_of(settings, results):
+    judge = Verdict(settings)
+    for one in results:
+        judge.take(one)
+    return judge.verdict()
+
+
+def test_a_match_that_stays_at_rest_while_the_vehicle_drives_is_noticed():
+    sequence = road("city", 25.0, 0.0, 12)
+    settings, results = tracked(sequence, "default", [AT_REST])
+    poses, truth = relative(results, sequence)
+    assert steps(poses).sum() < 0.5 * steps(truth).sum()
+    found = verdict_of(settings, results)
+    assert found["state"] != "sound"
+    assert found["since_s"] <= 0.3
+    assert "another motion" in " ".join(found["reasons"])
+
+
+@needs_shared
+@pytest.mark.parametrize("recipe", ["default", "fast_lio2", "lio_sam", "loam"])
+def test_a_real_drive_that_is_taken_for_standing_is_lost(recipe):
+    sequence = open_sequence(DRIVE)
+    found = verdict_of(*tracked(sequence, recipe, [AT_REST], scans=sequence.scans(0, 20)))
+    assert (found["state"], found["since_s"] < 0.3) == ("lost", True)
+
+
+@pytest.mark.parametrize("recipe", ["default", "fast_lio2", "lio_sam", "loam"])
+def test_a_right_start_is_sound(recipe):
+    found = verdict_of(*tracked(road("street", 25.0, 0.0, 8), recipe))
+    assert found == {"state": "sound", "since_s": None, "reasons": []}
+    assert in_words(found) == "sound"
+
+
+def test_summary_metrics_and_report_state_the_verdict(tmp_path, capsys):
+    drive, out = str(tmp_path / "drive"), tmp_path / "run"
+    assert main(["sim", "street", "--sensor", "vlp16", "--duration", "2", "--seed", "1", "--out", drive]) == 0
+    assert main(["run", drive, "--out", str(out), "--set", "config.output.recording=false"]) == 0
+    assert "verdict    sound" in capsys.readouterr().out
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["verdict"] == {"state": "sound", "since_s": None, "reasons": []}
+    assert "verdict" in (out / "report.html").read_text()
