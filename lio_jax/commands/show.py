@@ -62,8 +62,8 @@ def view(path: Path, web: bool) -> None:
         show(recording)
         return
     with served(recording) as server:
-        say(f"open {server.page}\nCtrl-C ends it.")
         try:
+            say(f"open {server.page}\nCtrl-C ends it.")
             server.process.wait()
         except KeyboardInterrupt:
             return

@@ -70,7 +70,7 @@ def first_velocity(
 
 
 def _points(scan: Scan) -> NDArray[np.float32]:
-    points = np.asarray(scan.points)[np.asarray(scan.mask)]
+    points = np.asarray(scan.points, np.float32)[np.asarray(scan.mask)]
     return points[np.isfinite(points).all(axis=1)]
 
 
@@ -178,10 +178,9 @@ class MotionCheck:
 
 
 def _view(scan: Scan, T_world_lidar: NDArray[np.float64]) -> PlanView:
-    points = np.asarray(scan.points)[np.asarray(scan.mask)]
-    points = points[:: max(1, len(points) // _POINTS)]
-    points = points[np.isfinite(points).all(axis=1)]
-    return plan_view(points @ T_world_lidar[:3, :3].T.astype(np.float32))
+    points = _points(scan)
+    level = Rotation.from_matrix(T_world_lidar[:3, :3])
+    return plan_view(_turned(points[:: max(1, len(points) // _POINTS)], level))
 
 
 def _error(reference: _Reference, view: PlanView, T_world_lidar: NDArray[np.float64]) -> float | None:

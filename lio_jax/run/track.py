@@ -275,7 +275,7 @@ def run_steps(stepper: Stepper, scan_inputs: Iterable[ScanInput]) -> Iterator[tu
                 held, opened = (fed, state, output), True
             else:
                 yield fed, state, output
-    except Exception:
+    except (KeyboardInterrupt, Exception):
         if held is not None:
             yield held
         raise
