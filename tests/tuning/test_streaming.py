@@ -33,6 +33,8 @@ SMOOTHER_STEPS = {
     **STEPS,
     "imu.gyro_noise": 1e-2,
     "imu.accel_noise": 1e-2,
+    "imu.gyro_bias_walk": 1e-2,
+    "imu.accel_bias_walk": 1e-2,
     "imu.gravity": 1e-5,
     "extrinsics": 1e-6,
 }
