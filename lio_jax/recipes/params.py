@@ -25,8 +25,8 @@ class LimitParams(eqx.Module):
     accel_bias: Scalar = leaf(1.0, "m/s^2", above=0)
     """Largest plausible accelerometer bias."""
     outage: Scalar = leaf(1.0, "s", above=0)
-    """Longest time without a matched scan. After it, a scan that meets less than a quarter of the map begins
-    a new piece of map at the predicted pose."""
+    """Longest time without a matched scan. After it, a scan with less than a quarter of its points on the map
+    begins a new piece of map at the predicted pose."""
 
 
 class MotionParams(eqx.Module):

@@ -111,7 +111,7 @@ class Outage(eqx.Module):
     """
 
     elapsed: Float[Array, ""]
-    """s."""
+    """Time since the last scan that was matched, s."""
     is_long: Bool[Array, ""]
     """Longer than ``params.limits.outage``."""
     usable: Int32[Array, ""]
