@@ -30,7 +30,7 @@ class DataConfig:
     compensated: Literal["auto", "yes", "no"] = static("auto")
     """Whether the recording's points are already motion compensated (KITTI odometry: yes)."""
     vertical_correction_deg: float = static(0.205, "deg")
-    """Correction of the HDL-64E's elevation angles, which is applied to KITTI odometry scans only."""
+    """Correction of the HDL-64E's elevation angles, which is applied to the scans of KITTI alone."""
     beams: int = static(0, least=0)
     """Beams for ring reconstruction where the recording holds no ring; 0: 16, 32 or 64 by the data."""
     scan_period: float = static(0.1, "s", above=0)

@@ -19,10 +19,12 @@ from lio_jax.data.time_order import Stamped, ascending, in_time_order
 from lio_jax.data.trajectory import Trajectory, read_kitti_poses
 from lio_jax.data.velodyne_file import (
     check_sizes,
+    elevation_note,
     hdl64_ring,
     listed,
     missing_numbers,
     numbered_files,
+    raise_elevation,
     read_returns,
 )
 
@@ -152,10 +154,7 @@ class KittiSequence:
             self._notes.append(
                 "point times from azimuth, half a sweep before to half a sweep after the camera's stamp"
             )
-        if correction := self._config.vertical_correction_deg:
-            self._notes.append(
-                f"elevation angles raised by {correction} deg (config.data.vertical_correction_deg)"
-            )
+        self._notes += elevation_note(self._config)
 
     def _read_calibration(self) -> NDArray[np.float64] | None:
         path = self._path / "calib.txt"
@@ -177,29 +176,6 @@ class KittiSequence:
                 return np.vstack([rows, [0.0, 0.0, 0.0, 1.0]])
         self._notes.append("calib.txt has no entry Tr (lidar to camera): no truth")
         return None
-
-
-def raise_elevation(points: NDArray[np.float32], angle_deg: float) -> NDArray[np.float32]:
-    """Raise each point's elevation angle by ``angle_deg``: rotate it about cross(p, z).
-
-    KITTI's intrinsic calibration is wrong by about 0.205 deg (IMLS-SLAM, Deschaud 2018). A point exactly
-    above or below has no such axis and is not moved.
-
-    Args:
-        points: (n, 3) m, lidar frame.
-        angle_deg: angle to add, deg; 0 returns the points as they are.
-    """
-    if angle_deg == 0.0 or len(points) == 0:
-        return points
-    cosine, sine = np.float32(np.cos(np.radians(angle_deg))), np.float32(np.sin(np.radians(angle_deg)))
-    x, y, z = points.T
-    horizontal = np.sqrt(x * x + y * y)
-    has_axis = horizontal > 0
-    scale = cosine - sine * z / np.where(has_axis, horizontal, np.float32(1.0))
-    raised = np.stack([x * scale, y * scale, z * cosine + horizontal * sine], axis=1)
-    if not has_axis.all():
-        raised[~has_axis] = points[~has_axis]
-    return raised
 
 
 def pose_files(path: Path) -> list[Path]:

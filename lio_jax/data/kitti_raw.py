@@ -18,10 +18,12 @@ from lio_jax.data.time_order import Stamped, ascending, in_time_order
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.data.velodyne_file import (
     check_sizes,
+    elevation_note,
     hdl64_ring,
     listed,
     missing_numbers,
     numbered_files,
+    raise_elevation,
     read_returns,
 )
 
@@ -181,6 +183,7 @@ class KittiRawSequence:
             if self._compensated
             else "point times from azimuth, clockwise from straight behind"
         )
+        self._notes += elevation_note(config)
 
     @property
     def info(self) -> SequenceInfo:
@@ -210,7 +213,7 @@ class KittiRawSequence:
             points = np.ascontiguousarray(rows[:, :3])
             yield LidarScan(
                 stamp_ns=sweep.stamp_ns,
-                points=points,
+                points=raise_elevation(points, self._config.vertical_correction_deg),
                 time=azimuth_time(points, sweep.duration, start_azimuth=KITTI_START_AZIMUTH),
                 ring=hdl64_ring(points),
                 intensity=np.ascontiguousarray(rows[:, 3]),
@@ -307,5 +310,5 @@ READER = Reader(
     "a KITTI raw drive (velodyne_points/data)",
     lambda path: (path / "velodyne_points").is_dir(),
     KittiRawSequence,
-    reads=frozenset({"compensated", "scan_period"}),
+    reads=frozenset({"compensated", "scan_period", "vertical_correction_deg"}),
 )

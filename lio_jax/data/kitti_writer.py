@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data.kitti import raise_elevation
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.data.trajectory import Trajectory, write_kitti_poses
+from lio_jax.data.velodyne_file import raise_elevation
 from lio_jax.data.whole_output import written_whole
 
 MARKER = "times.txt"

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lio_jax.data.config import DataConfig
 from lio_jax.data.pointcloud2 import valid_returns
 from lio_jax.data.reconstruct import ring_from_azimuth_wraps, ring_from_elevation
 
@@ -70,6 +71,37 @@ def hdl64_ring(points: NDArray[np.float32]) -> NDArray[np.int32]:
     if ring.size and ring[-1] >= _HDL64_BEAMS:
         return ring_from_elevation(points, _HDL64_BEAMS)
     return ring
+
+
+def raise_elevation(points: NDArray[np.float32], angle_deg: float) -> NDArray[np.float32]:
+    """Raise each point's elevation angle by ``angle_deg``: rotate it about cross(p, z).
+
+    KITTI's intrinsic calibration is wrong by about 0.205 deg (IMLS-SLAM, Deschaud 2018). A point exactly
+    above or below has no such axis and is not moved.
+
+    Args:
+        points: (n, 3) m, lidar frame.
+        angle_deg: angle to add, deg; 0 returns the points as they are.
+    """
+    if angle_deg == 0.0 or len(points) == 0:
+        return points
+    cosine, sine = np.float32(np.cos(np.radians(angle_deg))), np.float32(np.sin(np.radians(angle_deg)))
+    x, y, z = points.T
+    horizontal = np.sqrt(x * x + y * y)
+    has_axis = horizontal > 0
+    scale = cosine - sine * z / np.where(has_axis, horizontal, np.float32(1.0))
+    raised = np.stack([x * scale, y * scale, z * cosine + horizontal * sine], axis=1)
+    if not has_axis.all():
+        raised[~has_axis] = points[~has_axis]
+    return raised
+
+
+def elevation_note(config: DataConfig) -> list[str]:
+    """Return a sentence on the correction of the elevation angles; none where there is no correction."""
+    correction = config.vertical_correction_deg
+    if not correction:
+        return []
+    return [f"elevation angles raised by {correction} deg (config.data.vertical_correction_deg)"]
 
 
 def _read_binary(path: Path, warn: Callable[[str], None]) -> NDArray[np.float32]:

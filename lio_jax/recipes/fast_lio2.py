@@ -7,8 +7,9 @@ Xu, Cai, He, Lin & Zhang, "FAST-LIO2: Fast direct LiDAR-inertial odometry", T-RO
 ``recipe_settings("fast_lio2")``. Without inertial samples the velocity is taken as constant.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -174,6 +175,13 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
     needs = Needs()
     config_type = FastLio2Config
     params_type = FastLio2Params
+    # where walls are near, the voxels and neighbourhoods for streets hold more than one
+    near_values: ClassVar[Mapping[str, float]] = {
+        "params.lidar.min_range": 0.5,
+        "params.map.voxel_size": 0.25,
+        "params.registration.point_spacing": 0.25,
+        "params.knn.radius": 1.0,
+    }
 
     def init(self, params: FastLio2Params, imu: ImuBatch | None = None) -> FastLio2State:
         """Return the state before the first scan: at the world's origin.

@@ -59,6 +59,12 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
     needs = Needs(imu="required", rings=True)
     config_type = LioSamConfig
     params_type = LioSamParams
+    # LIO-SAM's values for indoors
+    near_values: ClassVar[Mapping[str, float]] = {
+        "params.map.voxel_size": 0.2,
+        "params.map.corner_voxel_size": 0.1,
+        "params.features.surface_spacing": 0.2,
+    }
     given_values: ClassVar[Mapping[str, Any]] = {
         "config.backend.gps_elevation": False,
         "params.gps.pose_variance": 25.0,
@@ -172,6 +178,7 @@ def _output(
         origin=frames.surface.origin,
         thinned_away=features.dropped,
         map_dropped=added.corner.dropped + added.surface.dropped,
+        too_few_features=~features.enough,
         new_piece=match.new_piece,
         log_evidence=log_evidence(smoothing.window.chain, smoothed),
         corners=jnp.arange(corners + surfaces) < corners,

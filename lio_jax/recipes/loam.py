@@ -9,7 +9,9 @@ Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014. Its va
 """
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -83,12 +85,9 @@ class LoamParams(RecipeParams):
 class LoamSizes:
     """Rounds and capacities."""
 
-    rounds: int = static(2, above=0)
-    """How often the matches of a scan are searched. After each search at most
-    ``config.registration.max_iterations`` steps follow."""
-    opening_rounds: int = static(15, above=0)
-    """How often matches are searched between the first two scans, where no velocity is known; it replaces
-    ``rounds`` there."""
+    rounds: int = static(15, above=0)
+    """Largest number of searches for the matches of a scan; A-LOAM has 2. After each search at most
+    ``config.registration.max_iterations`` steps follow. The search ends earlier once the pose rests."""
     compensate: bool = static(True)
     """Compensate the motion within a scan, as the pose under trial implies it."""
     mapping_every: int = static(1, above=0)
@@ -148,6 +147,11 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
     needs = Needs(imu="unused", rings=True)
     config_type = LoamConfig
     params_type = LoamParams
+    # voxels for rooms: where walls are near, those for streets hold more than one
+    near_values: ClassVar[Mapping[str, float]] = {
+        "params.map.voxel_size": 0.2,
+        "params.map.corner_voxel_size": 0.1,
+    }
 
     def init(self, params: LoamParams, imu: ImuBatch | None = None) -> LoamState:
         """Return the state before the first scan: at the world's origin, with an empty map.
@@ -201,8 +205,6 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             middle = motion.middle
         with jax.named_scope("scan_to_scan"):
             picks = _Compensated(features.sharp, features.flat, motion, config.loam.compensate)
-            # no velocity is known yet
-            opening = (state.scans == 1) | jnp.all(state.twist == 0)
             match = ScanToScan(
                 points_at=picks,
                 T_predicted=motion.predicted(),
@@ -211,11 +213,7 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
                 last=state.map.last,
                 limits=params.scan_to_scan,
             )
-            odometry = gauss_newton(
-                match,
-                jnp.where(opening, jnp.int32(config.loam.opening_rounds), jnp.int32(config.loam.rounds)),
-                config.registration.max_iterations,
-            )
+            odometry = gauss_newton(match, config.loam.rounds, config.registration.max_iterations)
             # after an outage the last scan shows another place
             bridged = motion.elapsed > params.limits.outage
             T_last_lidar = jnp.where(bridged, motion.predicted().wxyz_xyz, odometry.T_world_lidar.wxyz_xyz)

@@ -64,6 +64,9 @@ class Output(eqx.Module):
     """Statistics of the match; None from recipes without a covariance."""
     log_evidence: Float[Array, ""] | None = None
     """Log marginal likelihood of all measurements since the smoother's start; None without a smoother."""
+    too_few_features: Bool[Array, ""] | None = None
+    """True if the scan has fewer corners or surface points than a match needs; None from recipes without such
+    a bound."""
     new_piece: Bool[Array, ""] | None = None
     """True if a new piece of map begins with the scan, at the predicted pose."""
     restarted: Bool[Array, ""] | None = None

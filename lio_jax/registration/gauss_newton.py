@@ -81,9 +81,7 @@ def observable_step(
     return scale * (vectors @ along), Directions(scale[:, None] * vectors, degenerate)
 
 
-def gauss_newton(
-    match: ScanMatch[Any, Any], max_searches: int | Int32[Array, ""], max_steps: int = 1
-) -> Registration:
+def gauss_newton(match: ScanMatch[Any, Any], max_searches: int, max_steps: int = 1) -> Registration:
     """Find the pose at which a scan fits its map best, by the match's robust measure.
 
     The loop searches what each point lies on, then takes a few steps. A search whose first step ends the

@@ -115,6 +115,8 @@ class ScanEvidence:
     """Time from the last scan's end to this scan's end, s; 0 for the first scan."""
     imu_gap_s: float | None
     """Longest time without an inertial sample since the last scan's end, s; None if no samples are used."""
+    features: tuple[int, int] | None = None
+    """Number of corners and surface points where they are too few for a match; None where they are not."""
     new_piece: bool = False
     """A new piece of map begins with the scan."""
     restarted: bool = False
@@ -180,6 +182,13 @@ def _match_failure(now: ScanEvidence, settings: Settings) -> str:
         return (
             f"the update was not finite ({_not_finite(found)}); state and covariance are the prediction's, "
             "the map was not changed."
+        )
+    if now.lost and now.features:
+        least = settings.values["submap"]
+        return (
+            f"it has {now.features[0]} corners and {now.features[1]} surface points, "
+            f"{least['min_corners']:g} and {least['min_surfaces']:g} are needed "
+            "(params.submap.min_corners and min_surfaces); the pose is the prediction."
         )
     if now.lost:
         needed = settings.values["registration"]["min_matches"]

@@ -57,6 +57,53 @@ def _reach(sequence: Sequence) -> float | None:
     return None
 
 
+_LINE_STEP = 0.1
+"""Largest median step of azimuth along a ring whose points follow each other, rad."""
+_TURNING = 0.8
+"""Share of the steps along a ring that have one sign where the beam turns about one axis."""
+_FEWEST_POINTS = 20
+"""Rings of fewer points do not count."""
+
+
+def with_point_order(settings: Settings, scans: Iterable[LidarScan]) -> tuple[Settings, list[str]]:
+    """Return settings for rings that swing to and fro, as a Livox's lines do, and a note on the change.
+
+    Columns of equal azimuth would tear such rings apart: their points keep the order of the scan instead.
+
+    Args:
+        settings: settings of a run; what was given stays.
+        scans: scans of the recording; the first one with rings decides.
+    """
+    features = getattr(settings.config, "features", None)
+    by_azimuth = isinstance(features, RingConfig) and features.order == "azimuth"
+    if not by_azimuth or "config.features.order" in settings.given:
+        return settings, []
+    signs = (_signs_along_rings(scan) for scan in islice(scans, _SCANS_WITH_RINGS))
+    known = next((sign for sign in signs if sign is not None), None)
+    if known is None or known > _TURNING:
+        return settings, []
+    reason = "rings swing to and fro as a Livox's do"
+    settings = settings.with_value("config.features.order", "arrival", reason)
+    return settings, [f"{reason}: config.features.order=arrival, their points keep the order of the scan."]
+
+
+def _signs_along_rings(scan: LidarScan) -> float | None:
+    """Return the median over rings of the share of azimuth's steps that have the more frequent sign.
+
+    None where no ring has enough points that follow each other.
+    """
+    shares = []
+    in_order = np.argsort(scan.time, kind="stable")
+    azimuth = np.arctan2(scan.points[in_order, 1], scan.points[in_order, 0])
+    ring = scan.ring[in_order]
+    for number in np.unique(ring[ring >= 0]):
+        steps = np.diff(azimuth[ring == number])
+        steps = np.remainder(steps + np.pi, 2 * np.pi) - np.pi
+        if len(steps) >= _FEWEST_POINTS and np.median(np.abs(steps)) < _LINE_STEP:
+            shares.append(max(np.mean(steps > 0), np.mean(steps < 0)))
+    return float(np.median(shares)) if shares else None
+
+
 _SCANS_WITH_RINGS = 10
 """Number of first scans: a single scan may miss the upper beams, and the first one may be incomplete."""
 _SLACK = 1.125

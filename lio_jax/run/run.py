@@ -15,7 +15,7 @@ from lio_jax.data.imu_checks import cleaned
 from lio_jax.data.sequence import LidarScan, Sequence, prefetched
 from lio_jax.imu.params import OrientedImuConfig
 from lio_jax.recipes.params import InertialConfig
-from lio_jax.run.fitted_settings import fitted_to_surroundings, with_sensor_sizes
+from lio_jax.run.fitted_settings import fitted_to_surroundings, with_point_order, with_sensor_sizes
 from lio_jax.run.folder import environment, write_json
 from lio_jax.run.global_correction import GlobalCorrection
 from lio_jax.run.logs import Failures, Overflow, ScanLog, StageTimes, TrajectoryLog
@@ -29,15 +29,16 @@ from lio_jax.settings.settings import Settings, with_extrinsics
 
 
 def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list[str]]:
-    """Take from the recording what was not given, and say so: T_imu_lidar, sizes of voxels and features."""
+    """Take from the recording what was not given, and say so: T_imu_lidar, sizes, the order of points."""
     settings, calibration = _calibrated(sequence, settings)
     settings, fitted = fitted_to_surroundings(sequence, settings)
+    settings, order = with_point_order(settings, sequence.scans())
     settings, sizes = with_sensor_sizes(settings, sequence.scans())
     unused = [
         f"config.data.{name} has no effect on a recording of the format {sequence.info.format}; leave it out."
         for name in without_effect(sequence.info.format, settings.run.data)
     ]
-    return settings, [calibration, *fitted, *sizes, *unused]
+    return settings, [calibration, *fitted, *order, *sizes, *unused]
 
 
 def _calibrated(sequence: Sequence, settings: Settings) -> tuple[Settings, str]:

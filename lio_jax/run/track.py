@@ -143,6 +143,7 @@ class ResultBuilder:
             lost=bool(output.lost),
             nis=float(output.nis),
             since_last_s=float(fed.scan.interval),
+            features=_few_features(output),
             new_piece=output.new_piece is not None and bool(output.new_piece),
             restarted=output.restarted is not None and bool(output.restarted),
             smoother_unfinished=output.smoother_unfinished is not None and bool(output.smoother_unfinished),
@@ -303,6 +304,14 @@ def pose_matrix(wxyz_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     pose[:3, :3] = Rotation.from_quat(wxyz_xyz[[1, 2, 3, 0]]).as_matrix()
     pose[:3, 3] = wxyz_xyz[4:]
     return pose
+
+
+def _few_features(output: Any) -> tuple[int, int] | None:
+    """Return the number of corners and of surface points where they are too few for a match."""
+    if output.too_few_features is None or not bool(output.too_few_features):
+        return None
+    real, corners = np.asarray(output.points_mask), np.asarray(output.corners)
+    return int(np.count_nonzero(real & corners)), int(np.count_nonzero(real & ~corners))
 
 
 def _imu_gap(samples: Any, scan: Any, nav: Any) -> float:

@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data.config import DataConfig
-from lio_jax.data.kitti import KittiSequence, raise_elevation
+from lio_jax.data.kitti import KittiSequence
+from lio_jax.data.velodyne_file import raise_elevation
 from tests.shared_data import SHARED_DATA, needs_shared
 
 REAL = SHARED_DATA / "kitti_odometry" / "sequences" / "04"

@@ -53,7 +53,8 @@ def write_drive(root: Path, count: int = 4, kind: str = "sync") -> Path:
 
 
 def opened(folder: Path, **config: object) -> KittiRawSequence:
-    return KittiRawSequence(folder, DataConfig(**config))  # type: ignore[arg-type]
+    """Open a drive, by default without the correction of the elevation angles."""
+    return KittiRawSequence(folder, DataConfig(**({"vertical_correction_deg": 0.0} | config)))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("kind", ["sync", "extract"])
@@ -62,6 +63,37 @@ def test_both_kinds_hold_the_same_points(tmp_path: Path, kind: str) -> None:
     assert len(scans) == 4
     np.testing.assert_array_equal(scans[2].points, cloud(2)[:, :3])
     np.testing.assert_array_equal(scans[2].intensity, cloud(2)[:, 3])
+
+
+@pytest.mark.parametrize("kind", ["sync", "extract"])
+def test_elevation_angles_are_raised_and_the_notes_say_so(tmp_path: Path, kind: str) -> None:
+    sequence = KittiRawSequence(write_drive(tmp_path, kind=kind), DataConfig())
+    points, recorded = next(sequence.scans()).points, cloud(0)[:, :3]
+    elevation, before = (np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])) for p in (points, recorded))
+    np.testing.assert_allclose(np.degrees(elevation - before), 0.205, atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), np.linalg.norm(recorded, axis=1), rtol=1e-5)
+    assert any("raised by 0.205 deg" in note for note in sequence.info.notes)
+
+
+def test_an_unsynchronised_drive_has_its_samples_at_their_own_rate(tmp_path: Path) -> None:
+    folder = write_drive(tmp_path, count=3, kind="extract")
+    shutil.rmtree(folder / "oxts" / "data")
+    (folder / "oxts" / "data").mkdir()
+    seconds = [0.01 * number + 0.003 for number in range(30)]
+    for number in range(30):
+        np.savetxt(folder / "oxts" / "data" / f"{number:010d}.txt", [packet(49.0 + 1e-6 * number)])
+    # as published: some samples carry the stamp of the one before, or an earlier one
+    seconds[7] = seconds[6]
+    seconds[20] = seconds[18] + 0.001
+    (folder / "oxts" / "timestamps.txt").write_text(stamps(*seconds))
+    (folder / "velodyne_points" / "data" / "0000000001.txt").unlink()
+    sequence = opened(folder)
+    imu = sequence.imu()
+    assert imu is not None
+    assert len(imu.stamp_ns) == 28
+    assert (np.diff(imu.stamp_ns) > 0).all()
+    assert [scan.stamp_ns for scan in sequence.scans()] == [SECOND * 10**9, SECOND * 10**9 + 200_000_000]
+    assert any("0000000001" in sentence for sentence in sequence.warnings_so_far)
 
 
 def test_stamp_is_the_start_and_duration_reaches_the_end(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, LOST, NOT_FINITE, ImuBatch
 from lio_jax.run.failures import ScanEvidence, failure_of, longest_gap, unobserved_directions
-from lio_jax.settings.settings import Settings, with_overrides
+from lio_jax.settings.settings import Settings, recipe_settings, with_overrides
 
 SETTINGS = Settings()
 UNTURNED = Rotation.identity()
@@ -62,6 +62,15 @@ def evidence(**fields) -> ScanEvidence:
 
 def said(before: ScanEvidence | None = None, settings: Settings = SETTINGS, **fields) -> str:
     return failure_of(evidence(**fields), before or evidence(), settings)
+
+
+def test_a_scan_with_too_few_features_says_how_many_it_has() -> None:
+    lio_sam = recipe_settings("lio_sam")
+    sentence = said(settings=lio_sam, lost=True, registration=match(status=np.int32(LOST)), features=(3, 260))
+    assert sentence.startswith(
+        "it has 3 corners and 260 surface points, 10 and 100 are needed (params.submap"
+    )
+    assert "matched" not in sentence
 
 
 def test_a_good_scan_gives_no_sentence() -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from lio_jax.data.sequence import LidarScan
 from lio_jax.lidar.params import LoamRingConfig
-from lio_jax.run.fitted_settings import with_sensor_sizes
+from lio_jax.run.fitted_settings import with_point_order, with_sensor_sizes
 from lio_jax.settings.settings import recipe_settings, with_overrides
 
 LOAM = recipe_settings("loam")
@@ -52,3 +52,43 @@ def test_a_recording_without_points_gets_the_usual_sizes(scans):
 def test_rings_of_a_few_points_leave_room_for_a_neighbourhood():
     features = with_sensor_sizes(LOAM, [scan(16, 3)])[0].config.features
     assert features.columns > 2 * features.neighbours
+
+
+LIO_SAM = recipe_settings("lio_sam")
+
+
+def lines(azimuth: np.ndarray, shuffled: bool = False) -> LidarScan:
+    """Four rings whose points follow each other along the azimuths (rad)."""
+    azimuth = np.repeat(azimuth, 4)
+    ring = np.tile(np.arange(4, dtype=np.int32), len(azimuth) // 4)
+    time = np.linspace(0, 0.1, len(ring)).astype(np.float32)
+    points = np.stack([10 * np.cos(azimuth), 10 * np.sin(azimuth), ring], axis=1).astype(np.float32)
+    order = np.random.default_rng(0).permutation(len(ring)) if shuffled else slice(None)
+    return LidarScan(0, points[order], time[order], ring[order], time[order], 0.1)
+
+
+def order_of(settings, *scans: LidarScan) -> tuple[str, list[str]]:
+    chosen, notes = with_point_order(settings, scans)
+    return chosen.config.features.order, notes
+
+
+def test_lines_that_swing_to_and_fro_keep_the_order_of_the_scan():
+    swings = lines(0.6 * np.sin(np.linspace(0, 40, 900)))
+    order, (note,) = order_of(LIO_SAM, scan(0, 0), swings)
+    assert order == "arrival"
+    assert "config.features.order=arrival" in note
+    given = with_overrides(LIO_SAM, ["config.features.order=azimuth"])
+    assert order_of(given, swings) == ("azimuth", [])
+
+
+@pytest.mark.parametrize("turns", [1, -1])
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_rings_of_a_turning_sensor_go_by_azimuth(turns, shuffled):
+    turning = lines(np.linspace(-np.pi, turns * 2 * np.pi - np.pi, 900), shuffled)
+    assert order_of(LIO_SAM, turning) == ("azimuth", [])
+
+
+def test_points_in_no_order_at_all_go_by_azimuth():
+    turning = lines(np.linspace(-np.pi, np.pi, 900), shuffled=True)
+    untimed = LidarScan(0, turning.points, np.zeros_like(turning.time), turning.ring, turning.time, 0.0)
+    assert order_of(LIO_SAM, untimed, scan(0, 0)) == ("azimuth", [])

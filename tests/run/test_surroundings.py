@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lio_jax.recipes import RECIPES
 from lio_jax.recipes.default import Default
 from lio_jax.run.fitted_settings import fitted_to_surroundings
 from lio_jax.settings.settings import recipe_settings, with_overrides
@@ -93,6 +94,12 @@ def test_what_was_given_stays():
     assert "voxel_size 0.4" not in notes[0]
 
 
-def test_other_recipes_keep_their_systems_values():
-    settings = recipe_settings("fast_lio2")
-    assert fitted_to_surroundings(Seeing(around(2.0)), settings) == (settings, [])
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_every_recipe_has_sizes_for_near_surroundings(recipe):
+    settings = recipe_settings(recipe)
+    fitted, notes = fitted_to_surroundings(Seeing(around(2.0)), settings)
+    assert len(notes) == 1
+    size = fitted.values["map"]["voxel_size"]
+    assert size < 0.6 * settings.values["map"]["voxel_size"]
+    assert f"map.voxel_size {size:g}" in notes[0]
+    assert fitted_to_surroundings(Seeing(around(30.0)), settings) == (settings, [])

@@ -36,7 +36,7 @@ def test_a_name_stands_for_its_values_and_nothing_counts_as_given(recipe):
 def test_each_recipe_has_the_values_of_the_system_it_stands_for():
     known = {
         "fast_lio2": {"params.map.voxel_size": 0.5, "params.imu.gyro_noise": (0.1 / 200) ** 0.5},
-        "loam": {"params.registration.kernel": 0.1, "config.loam.rounds": 2},
+        "loam": {"params.registration.kernel": 0.1, "params.knn.radius": 1.0},
         "lio_sam": {"params.lidar.max_range": 1000.0, "config.features.order": "azimuth"},
     }
     for recipe, values in known.items():
