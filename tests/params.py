@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from lio_jax.core.leaf import numbers_of, section, settings_of, traced
-from lio_jax.estimation.params import SmootherParams
 from lio_jax.imu.params import OrientedImuConfig
 from lio_jax.lidar.params import (
     BeamParams,
@@ -21,6 +20,7 @@ from lio_jax.mapping.params import (
     VoxelMapParams,
 )
 from lio_jax.recipes.default_params import ThinnedInertialConfig, ThinnedScanConfig, VoxelMatch
+from lio_jax.recipes.lio_sam_params import SmootherParams
 from lio_jax.recipes.params import InertialParams, MotionParams, RecipeConfig
 from lio_jax.registration.params import KnnConfig, ScanToScanParams, ScoredLineFitParams
 

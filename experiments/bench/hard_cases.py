@@ -1,28 +1,38 @@
-"""Measure the recipes where odometry goes wrong: starts at speed, and outages.
+"""Measure the recipes where odometry goes wrong: starts at speed, outages, hard scenes and wrong set-ups.
 
-python experiments/bench/hard_cases.py starts python experiments/bench/hard_cases.py starts --recipes
-default,loam --seeds 5 --lidar-only python experiments/bench/hard_cases.py drive --recording KITTI_RAW_DRIVE
---starts 0 10 20 30 python experiments/bench/hard_cases.py outages [--json]
+python experiments/bench/hard_cases.py starts [--recipes default,loam] [--seeds 5] [--lidar-only]
+python experiments/bench/hard_cases.py drive --recording KITTI_RAW_DRIVE --starts 0 10 20 30
+python experiments/bench/hard_cases.py outages [--json FILE]
+python experiments/bench/hard_cases.py scenes [--seeds 3]
+python experiments/bench/hard_cases.py set-ups [--recipes default] [--seeds 7]
 
-A start is right if every move after the third scan is within 5 % of the true one, and the last position
-within 5 % of the way. A miss is a start that is not right and whose verdict is sound.
+A scene is passed if the error stays below one percent of the way, or a warning comes before the error exceeds
+one metre. A wrong set-up is found if a fault is named within 20 s. A start is right if every move after the
+third scan is within 5 % of the true one, and the last position within 5 % of the way. A miss is a start that
+is not right and whose verdict is sound.
 """
 
 import argparse
 import json
-from collections.abc import Callable, Iterable
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from roads import driven_along, road_scene
+from scipy.spatial.transform import Rotation
 
 from lio_jax.commands.runtime import prepare_jax
 from lio_jax.data.detect import open_sequence
-from lio_jax.data.sequence import LidarScan, Sequence
+from lio_jax.data.sequence import ImuData, LidarScan, Sequence
+from lio_jax.data.trajectory import Trajectory
 from lio_jax.run.run import imu_feed, settings_for
+from lio_jax.run.set_up_check import Fault, SetUpCheck
+from lio_jax.run.sinks import RunResult
 from lio_jax.run.track import ScanResult, track
 from lio_jax.run.verdict import Verdict
 from lio_jax.settings.settings import recipe_settings, with_overrides
@@ -38,20 +48,39 @@ BEFORE, AFTER = 100, 100
 """Number of scans before an outage and after it."""
 
 
-def ran(
-    sequence: Sequence, scans: Iterable[LidarScan], recipe: str, lidar_only: bool = False
-) -> tuple[list[ScanResult], str]:
-    """Return a recipe's results over some scans, and the state of the verdict."""
+@dataclass(frozen=True)
+class Judged:
+    """A run with its verdict."""
+
+    results: list[ScanResult]
+    verdict: dict[str, Any]
+    faults: list[Fault]
+
+
+def judged(sequence: Sequence, scans: Iterable[LidarScan], recipe: str, lidar_only: bool = False) -> Judged:
+    """Return a recipe's results over some scans, and what the run says of itself."""
     settings = recipe_settings(recipe)
     if lidar_only and recipe != "loam":
         settings = with_overrides(settings, ["config.imu.use=false"])
     settings, _ = settings_for(sequence, settings)
     imu, _ = imu_feed(sequence, settings)
-    results, judge = [], Verdict(settings)
+    results, run = [], RunResult()
+    check, judge = SetUpCheck(settings, imu.samples if imu else None), Verdict(settings)
     for result in track(settings, scans, imu):
+        check.take(result)
         judge.take(result)
         results.append(result)
-    return results, judge.verdict()["state"]
+    check.finish(run)
+    judge.finish(run)
+    return Judged(results, run.metrics["verdict"], list(check.faults.values()))
+
+
+def ran(
+    sequence: Sequence, scans: Iterable[LidarScan], recipe: str, lidar_only: bool = False
+) -> tuple[list[ScanResult], str]:
+    """Return a recipe's results over some scans, and the state of the verdict."""
+    run = judged(sequence, scans, recipe, lidar_only)
+    return run.results, run.verdict["state"]
 
 
 def relative(results: list[ScanResult], sequence: Sequence) -> tuple[np.ndarray, np.ndarray]:
@@ -187,6 +216,164 @@ def outages(options: argparse.Namespace) -> list[Row]:
     return rows
 
 
+SCENES: dict[str, dict[str, Any]] = {
+    "drone over a field": {"world": "field"},
+    "stairs": {"world": "stairs"},
+    "8 beams in a street": {"world": "street", "beams": 8},
+    "8 beams in a city": {"world": "city", "beams": 8},
+    "tunnel": {"world": "tunnel"},
+    "office by hand": {"world": "office"},
+}
+"""Arguments of the simulator."""
+
+
+def scenes(options: argparse.Namespace) -> list[Row]:
+    """Return whether each recipe stays right in a hard scene, or warns in time."""
+    rows = []
+    print("| recipe | scene | way, m | largest error, m | at 1 m: s | warned at, s | passed |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for (name, arguments), seed in product(SCENES.items(), range(options.seeds)):
+        sequence = SimulatedSequence(duration_s=20.0, seed=seed, imu=ImuModel(), **arguments)
+        scans = list(sequence.scans())
+        for recipe in options.recipes:
+            run = judged(sequence, scans, recipe, options.lidar_only)
+            estimated, true = relative(run.results, sequence)
+            error = np.linalg.norm((estimated - true)[:, :3, 3], axis=1)
+            way = float(moves(true).sum())
+            beyond = np.flatnonzero(error > 1.0)
+            late = float(beyond[0] * 0.1) if len(beyond) else None
+            warned = run.verdict["since_s"] if run.verdict["state"] != "sound" else None
+            right = error.max() < 0.01 * way
+            passed = bool(right or (warned is not None and (late is None or warned <= late)))
+            rows.append(
+                {"recipe": recipe, "scene": name, "seed": seed, "way_m": way, "error_m": float(error.max())}
+                | {"late_s": late, "warned_s": warned, "passed": passed, "right": bool(right)}
+            )
+            words = ["-" if value is None else f"{value:.1f}" for value in (late, warned)]
+            print(
+                f"| {recipe} | {name} {seed} | {way:.0f} | {error.max():.2f} | {words[0]} | {words[1]} | "
+                f"{'yes' if passed else 'NO'} |",
+                flush=True,
+            )
+    return rows
+
+
+class Faulty:
+    """A recording with a wrong set-up."""
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        turn: Rotation | None = None,
+        move: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        late_s: float = 0.0,
+        axes: NDArray | None = None,
+        gyro: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        sweep: float = 1.0,
+    ) -> None:
+        """Change a recording.
+
+        Args:
+            sequence: the right one.
+            turn: of the extrinsic.
+            move: of the extrinsic, m.
+            late_s: added to the inertial stamps.
+            axes: (3, 3) turn of the inertial samples.
+            gyro: factors of the gyroscope's axes.
+            sweep: factor of the points' times.
+        """
+        T_imu_lidar = np.array(sequence.info.T_imu_lidar)
+        if turn is not None:
+            T_imu_lidar[:3, :3] = T_imu_lidar[:3, :3] @ turn.as_matrix()
+        T_imu_lidar[:3, 3] += move
+        self.info = replace(sequence.info, T_imu_lidar=T_imu_lidar)
+        self.warnings_so_far = ()
+        self._sequence, self._late_s, self._sweep = sequence, late_s, sweep
+        self._axes, self._gyro = np.eye(3) if axes is None else axes, np.array(gyro)
+
+    def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
+        """Yield the scans, their sweeps stretched."""
+        for scan in self._sequence.scans(start, count):
+            yield self.changed(scan)
+
+    def changed(self, scan: LidarScan) -> LidarScan:
+        """Return a scan with its sweep stretched."""
+        return replace(scan, time=scan.time * self._sweep, duration=scan.duration * self._sweep)
+
+    def imu(self) -> ImuData:
+        """Return the samples, changed."""
+        imu = self._sequence.imu()
+        return replace(
+            imu,
+            stamp_ns=imu.stamp_ns + round(self._late_s * 1e9),
+            gyro=imu.gyro * self._gyro @ self._axes.T,
+            accel=imu.accel @ self._axes.T,
+        )
+
+    def gps(self) -> None:
+        """Return None."""
+
+    def truth(self) -> Trajectory:
+        """Return the truth of the right recording."""
+        return self._sequence.truth()
+
+
+SET_UPS: dict[str, dict[str, Any]] = {
+    "rotation 10 deg about x": {"turn": Rotation.from_euler("x", 10, degrees=True)},
+    "rotation 5 deg about z": {"turn": Rotation.from_euler("z", 5, degrees=True)},
+    "translation 0.5 m": {"move": (0.5, 0.0, 0.0)},
+    "clock 50 ms late": {"late_s": 0.05},
+    "clock 30 ms early": {"late_s": -0.03},
+    "IMU turned by 90 deg": {"axes": Rotation.from_euler("z", 90, degrees=True).as_matrix()},
+    "gyroscope's z has the wrong sign": {"gyro": (1.0, 1.0, -1.0)},
+    "gyroscope at half its rates": {"gyro": (0.5, 0.5, 0.5)},
+    "sweeps of twice the length": {"sweep": 2.0},
+    "8 beams": {},
+}
+"""Arguments of :class:`Faulty`."""
+WORLDS_OF_SET_UPS = ("street", "city", "field")
+
+
+def set_ups(options: argparse.Namespace) -> list[Row]:
+    """Return which faults of the set-up are named, and which are although nothing is wrong."""
+    rows = []
+    print("| recipe | world | set-up | named | verdict |")
+    print("| --- | --- | --- | --- | --- |")
+    for world, seed in product(WORLDS_OF_SET_UPS, range(options.seeds)):
+        cases = {"right": {}} | (SET_UPS if seed == 0 else {})
+        for (name, changes), recipe in product(cases.items(), options.recipes):
+            beams = 8 if name == "8 beams" else None
+            sequence = _twenty_seconds(world, seed, beams)
+            faulty = Faulty(sequence, **changes)
+            scans = [faulty.changed(scan) for scan in _scans_of(world, seed, beams)]
+            run = judged(faulty, scans, recipe)
+            named = [f"{fault.kind} at {fault.since_s:.1f} s" for fault in run.faults]
+            rows.append(
+                {"recipe": recipe, "world": world, "seed": seed, "set_up": name, "named": named}
+                | {"sentences": [fault.sentence for fault in run.faults], "verdict": run.verdict["state"]}
+            )
+            words = ", ".join(named) or "-"
+            print(f"| {recipe} | {world} {seed} | {name} | {words} | {run.verdict['state']} |", flush=True)
+    for recipe in options.recipes:
+        wrong = [row for row in rows if row["recipe"] == recipe and row["set_up"] != "right"]
+        right = [row for row in rows if row["recipe"] == recipe and row["set_up"] == "right"]
+        print(
+            f"{recipe}: {sum(bool(row['named']) for row in wrong)} of {len(wrong)} named, "
+            f"{sum(bool(row['named']) for row in right)} false ones in {len(right)} sound runs"
+        )
+    return rows
+
+
+@lru_cache(maxsize=2)
+def _twenty_seconds(world: str, seed: int, beams: int | None) -> SimulatedSequence:
+    return SimulatedSequence(world, duration_s=20.0, seed=seed, beams=beams, imu=ImuModel())
+
+
+@lru_cache(maxsize=2)
+def _scans_of(world: str, seed: int, beams: int | None) -> list[LidarScan]:
+    return list(_twenty_seconds(world, seed, beams).scans())
+
+
 def covered(scan: LidarScan) -> LidarScan:
     """Return the returns of something that covers the sensor."""
     points = np.random.default_rng(0).normal(size=(len(scan.points), 3)).astype(np.float32) * 0.15
@@ -197,6 +384,8 @@ SECTIONS: dict[str, Callable[[argparse.Namespace], list[Row]]] = {
     "starts": starts,
     "drive": drive,
     "outages": outages,
+    "scenes": scenes,
+    "set-ups": set_ups,
 }
 
 

@@ -101,8 +101,8 @@ def _quick_hand(recording: Recording) -> Trajectory:
     import jax
     import jax.numpy as jnp
 
+    from lio_jax.sim.sequence import build
     from lio_jax.sim.trajectory import motion_along, pose_at
-    from lio_jax.sim.world_registry import build
 
     motion = motion_along(
         build(recording.world, recording.seed).route,

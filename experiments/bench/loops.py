@@ -177,7 +177,7 @@ def town(
     """
     from simulated_keyframes import drifted, keyframes_of, times_along
 
-    from lio_jax.sim.world_registry import build
+    from lio_jax.sim.sequence import build
 
     truth = lap_twice(name, seed, again, aside, loop, spacing)
     odometry = drifted(truth, scale=0.01, heading=1.2e-4, noise=0.02, seed=seed)
@@ -193,7 +193,7 @@ def lap_twice(
 
     from lio_jax.sim.blocks import LANE, PITCH
     from lio_jax.sim.blocks import lap as lap_of
-    from lio_jax.sim.world_registry import build
+    from lio_jax.sim.sequence import build
 
     world = build(name, seed).world
     # the world's origin is the start of its own route
@@ -207,7 +207,7 @@ def tunnel(spacing: float = 1.0) -> Drive:
     """Return a drive through a smooth tunnel, and back in the same lane."""
     from simulated_keyframes import drifted, driven, keyframes_of, times_along
 
-    from lio_jax.sim.world_registry import build
+    from lio_jax.sim.sequence import build
 
     world = build("tunnel", 0).world
     along = np.arange(0.0, 660.0, spacing)

@@ -172,7 +172,7 @@ def recorded(entry: dict[str, Any], folder: Path, place: str) -> list[Recorded]:
 def simulated(entry: dict[str, Any], seeds: tuple[int, ...], place: str) -> list[Simulated]:
     """Return an entry with ``sim`` once for each seed; ``entry`` is checked, with keys of SIMULATED_KEYS."""
     from lio_jax.sim.sensors import SENSORS
-    from lio_jax.sim.world_registry import WORLDS
+    from lio_jax.sim.sequence import WORLDS
 
     drive = Simulated(**{"name": entry["sim"], **entry})
     for kind, name, known in (("world", drive.sim, WORLDS), ("sensor", drive.sensor, SENSORS)):

@@ -188,7 +188,7 @@ def run_into(
             recording = stack.enter_context(ViewerRecording(out / "recording.rrd", total, address))
             sinks.append(RecordingSink(recording, out, truth))
         sinks.append(_ProgressBar(total))
-        result = run_sequence(sequence, settings, out, start, count, sinks)
+        result = run_sequence(sequence, settings, out, start, count, sinks, notify=say)
         if isinstance(result.interruption, KeyboardInterrupt):
             say("interrupted: finishing the files of what was computed ...")
     result.metrics["notes"] = [*sequence.info.notes, *notes]

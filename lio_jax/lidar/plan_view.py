@@ -55,8 +55,12 @@ class Displacement(NamedTuple):
     @property
     def is_certain(self) -> bool:
         """Return whether no rival explains the views nearly as well."""
-        lead = self.votes - self.votes_of_rival
-        return self.share > 0.5 and lead > max(3 * self.votes**0.5, 0.15 * self.votes)
+        return self.share > 0.5 and self.votes - self.votes_of_rival > self.least_lead
+
+    @property
+    def least_lead(self) -> float:
+        """Number of votes by which the best displacement has to lead."""
+        return max(3 * self.votes**0.5, 0.15 * self.votes)
 
 
 def plan_view(points: NDArray[np.float32]) -> PlanView:

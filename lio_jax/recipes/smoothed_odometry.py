@@ -11,10 +11,9 @@ from lio_jax.core.types import ImuBatch, NavState
 from lio_jax.estimation.factors import PoseMeasurement, fixed_information
 from lio_jax.estimation.marginal_prior import gaussian_prior
 from lio_jax.estimation.motion_state import DOF, POSE_DOF, MotionState
-from lio_jax.estimation.params import SmootherParams
 from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.estimation.sliding_window import Added, Window, open_window, still_link
-from lio_jax.recipes.lio_sam_params import LioSamConfig, LioSamParams
+from lio_jax.recipes.lio_sam_params import LioSamConfig, LioSamParams, SmootherParams
 from lio_jax.registration.gauss_newton import Registration
 
 

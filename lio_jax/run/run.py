@@ -3,7 +3,7 @@
 import resource
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Listing
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -21,6 +21,7 @@ from lio_jax.run.global_correction import GlobalCorrection
 from lio_jax.run.logs import Failures, Overflow, ScanLog, StageTimes, TrajectoryLog
 from lio_jax.run.map_file import MapFile
 from lio_jax.run.scan_inputs import OFFSET_MARGIN_S, ImuFeed
+from lio_jax.run.set_up_check import SetUpCheck
 from lio_jax.run.sinks import RunResult, Sink, finish_all
 from lio_jax.run.state_files import ImuRateFile, StateFiles
 from lio_jax.run.track import CompiledStep, ScanResult, track
@@ -61,6 +62,7 @@ def run_sequence(
     start: int = 0,
     count: int | None = None,
     sinks: Listing[Sink] = (),
+    notify: Callable[[str], None] | None = None,
 ) -> RunResult:
     """Estimate the recording's trajectory and map, and write the run folder's files.
 
@@ -75,6 +77,7 @@ def run_sequence(
         sinks: your own, derived from :class:`lio_jax.Sink`: each takes every scan's result after the run's
             own sinks, and finishes after them, when their files are written. What it raises in ``take`` ends
             the run early; what it raises in ``finish`` costs its own results alone.
+        notify: takes each sentence on a fault of the set-up as soon as it is known.
 
     Raises:
         UsageError: the recording ends before ``start``.
@@ -90,7 +93,8 @@ def run_sequence(
         imu, imu_notes = imu_feed(sequence, settings)
         log, times = TrajectoryLog(), StageTimes("decode", "pad", "step", "record", "total")
         # the log last: wherever Ctrl-C comes, the others have every scan that it has
-        everyone: list[Sink] = [times, Overflow(settings), Failures(start), Verdict(settings)]
+        everyone: list[Sink] = [times, Overflow(settings), Failures(start)]
+        everyone += [SetUpCheck(settings, imu.samples if imu else None, notify), Verdict(settings)]
         everyone += [ScanLog(out / "scans.npz", start), log]
         for sink in _result_files(sequence, settings, out, imu, log):
             stack.callback(sink.close)

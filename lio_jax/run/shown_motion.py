@@ -5,6 +5,7 @@ not moved. The plan view of what stands upright shows how far the vehicle went, 
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,6 +127,16 @@ def _turned(points: NDArray[np.float32], rotation: Rotation) -> NDArray[np.float
 
 _AFTER = (1, 3, 9)
 """Numbers of scans after a reference at which the motion since then is compared."""
+_TURNING = 0.02
+"""A turn between two scans above which the motion is compared too, rad: a wrong gyroscope shows in turns."""
+_TURNS_COMPARED, _BETWEEN_TURNS = 5, 20
+"""Number of references that are begun for a turn, and the least number of scans between references."""
+_TURN_ERRORS = np.delete(np.arange(-15, 16), 15) * 0.02
+"""Errors of the turn about the vertical that are searched where the estimated turn explains nothing, rad."""
+_LEAST_TURN_ERROR = 0.06
+"""Smaller errors of the turn are not told from none, rad."""
+_ARM = 15.0
+"""Distance at which an error of the turn counts as an error of the motion, m."""
 _EVERY = 100
 """Number of scans from one reference to the next."""
 _REACH = 5.0
@@ -143,17 +154,30 @@ class _Reference:
     T_world_lidar: NDArray[np.float64]
 
 
+class ShownMotion(NamedTuple):
+    """What plan views show of the motion between two scans, beside the estimate."""
+
+    error: float
+    """Distance by which the estimate misplaces what stands 15 m away, m."""
+    turn: float
+    """Turn about the vertical that the plan views show, rad."""
+    scans: int
+    """Number of scans from the first of the two to the second."""
+
+
 class MotionCheck:
     """Compares the estimated motion with the plan views of single scans."""
 
     def __init__(self) -> None:
         self._reference: _Reference | None = None
         self._next = 0
+        self._turns = 0
+        self._before: NDArray[np.float64] | None = None
 
     def __call__(
         self, index: int, scan: Scan, T_world_lidar: NDArray[np.float64], lost: bool
-    ) -> float | None:
-        """Return the error of the motion since the reference, m; None where nothing was compared.
+    ) -> ShownMotion | None:
+        """Return what the plan views show of the motion since the reference; None: nothing was compared.
 
         Args:
             index: number of the scan.
@@ -165,16 +189,25 @@ class MotionCheck:
             # the next matched scan is compared with the one after it
             self._reference, self._next = None, index + 1
             return None
-        reference, error = self._reference, None
+        reference, shown = self._reference, None
         since = index - reference.index if reference else 0
-        if index < self._next and since not in _AFTER:
+        turning = self._is_turning(T_world_lidar) and since >= _BETWEEN_TURNS
+        begins = index >= self._next or turning
+        if not begins and since not in _AFTER:
             return None
         view = _view(scan, T_world_lidar)
         if reference is not None and since in _AFTER:
-            error = _error(reference, view, T_world_lidar)
-        if index >= self._next:
+            shown = _shown(reference, view, T_world_lidar, since)
+        if begins:
+            self._turns += turning
             self._reference, self._next = _Reference(index, view, T_world_lidar), index + _EVERY
-        return error
+        return shown
+
+    def _is_turning(self, T_world_lidar: NDArray[np.float64]) -> bool:
+        before, self._before = self._before, T_world_lidar
+        if before is None or self._turns >= _TURNS_COMPARED:
+            return False
+        return abs(_turn_about_vertical(before, T_world_lidar)) > _TURNING
 
 
 def _view(scan: Scan, T_world_lidar: NDArray[np.float64]) -> PlanView:
@@ -183,14 +216,34 @@ def _view(scan: Scan, T_world_lidar: NDArray[np.float64]) -> PlanView:
     return plan_view(_turned(points[:: max(1, len(points) // _POINTS)], level))
 
 
-def _error(reference: _Reference, view: PlanView, T_world_lidar: NDArray[np.float64]) -> float | None:
-    """Return the distance of the displacement that the views show from the estimated one, m; None: no
-    telling."""
-    moved = (T_world_lidar - reference.T_world_lidar)[:2, 3]
+def _shown(
+    reference: _Reference, view: PlanView, T_world_lidar: NDArray[np.float64], scans: int
+) -> ShownMotion | None:
+    """Return what two views show of the motion between them; None where they do not show it."""
+    moved = (T_world_lidar - reference.T_world_lidar)[:2, 3].astype(np.float32)
     if np.linalg.norm(moved) > _FAR:
         return None
-    found = displacement(reference.view, view.centers + moved.astype(np.float32), _REACH, _STEP)
-    return float(np.linalg.norm(found.shift)) if found.is_certain else None
+    turn = _turn_about_vertical(reference.T_world_lidar, T_world_lidar)
+    as_estimated = displacement(reference.view, view.centers + moved, _REACH, _STEP)
+    if as_estimated.is_certain:
+        return ShownMotion(float(np.linalg.norm(as_estimated.shift)), turn, scans)
+    every = max(1, len(view.centers) // _COARSELY)
+
+    def votes(angle: float) -> int:
+        return displacement(reference.view, view.turned(angle)[::every] + moved, _REACH, _STEP).votes
+
+    angle = max(_TURN_ERRORS, key=votes)
+    turned = displacement(reference.view, view.turned(angle) + moved, _REACH, _STEP)
+    lead = turned.votes - as_estimated.votes
+    if not turned.is_certain or abs(angle) < _LEAST_TURN_ERROR or lead < turned.least_lead:
+        return None
+    error = float(np.linalg.norm(turned.shift)) + _ARM * abs(float(angle))
+    return ShownMotion(error, turn + float(angle), scans)
+
+
+def _turn_about_vertical(before: NDArray[np.float64], after: NDArray[np.float64]) -> float:
+    """Return the turn between two poses (4, 4) about the world's vertical, rad."""
+    return float(Rotation.from_matrix(after[:3, :3] @ before[:3, :3].T).as_rotvec()[2])
 
 
 _FAR = 15.0

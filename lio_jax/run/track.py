@@ -17,7 +17,7 @@ from lio_jax.recipes.params import RecipeParams as Params
 from lio_jax.recipes.transforms import RecipeLike, Stepper, reopened, with_first_velocity
 from lio_jax.run.failures import ScanEvidence, failure_of, longest_gap
 from lio_jax.run.scan_inputs import ImuFeed, bucket_for, padded
-from lio_jax.run.shown_motion import MotionCheck, first_velocity
+from lio_jax.run.shown_motion import MotionCheck, ShownMotion, first_velocity
 from lio_jax.settings.settings import Settings, recipe_of
 
 
@@ -41,9 +41,13 @@ class ScanResult:
     """pad: copying into padded arrays; step: transfer, estimation and the way back; total: their sum."""
     failure: str
     """What went wrong with this scan, or nothing."""
-    motion_error: float | None = None
-    """Error of the motion since an earlier scan that the plan view shows, m; None where it was not
-    compared."""
+    duration: float = 0.0
+    """Time from the scan's first to its last point, s; 0 where it is compensated already."""
+    beams: int | None = None
+    """Number of beams, each at an elevation of its own; 0 where rings are unknown or no such beams, and None
+    where they were not counted."""
+    shown_motion: ShownMotion | None = None
+    """What plan views show of the motion since an earlier scan; None where it was not compared."""
     raw: NDArray[np.float32] | None = None
     """(k, 3) some of the points as recorded, m in the lidar frame of their own firing, for pictures."""
 
@@ -161,7 +165,9 @@ class ResultBuilder:
             scan_points=fed.count,
             stage_ms={"pad": fed.pad_ms, "step": step_ms, "total": fed.pad_ms + step_ms},
             failure=failure,
-            motion_error=self._check(fed.index, fed.scan, T_world_lidar, evidence.lost or not fed.usable),
+            duration=float(fed.scan.duration),
+            beams=None if fed.index % _BEAMS_EVERY else beams_of(fed.scan),
+            shown_motion=self._check(fed.index, fed.scan, T_world_lidar, evidence.lost or not fed.usable),
             raw=_some(np.asarray(fed.scan.points)[: fed.count]),
         )
 
@@ -282,6 +288,26 @@ def run_steps(stepper: Stepper, scan_inputs: Iterable[ScanInput]) -> Iterator[tu
         raise
     if held is not None:
         yield held
+
+
+_BEAMS_EVERY = 50
+"""Number of scans from one count of the beams to the next."""
+_NARROW = 0.02
+"""Half of the points of a beam lie within this elevation, rad; the lines of a Livox swing."""
+
+
+def beams_of(scan: Scan) -> int:
+    """Return the number of rings of a scan; 0 where they are unknown or swing in elevation."""
+    mask = np.asarray(scan.mask) & (np.asarray(scan.ring) >= 0)
+    ring, points = np.asarray(scan.ring)[mask][::_EVERY_POINT], np.asarray(scan.points)[mask][::_EVERY_POINT]
+    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    numbers = np.unique(ring)
+    spreads = [np.subtract(*np.percentile(elevation[ring == number], [75, 25])) for number in numbers]
+    return len(numbers) if len(numbers) and np.median(spreads) < _NARROW else 0
+
+
+_EVERY_POINT = 7
+"""One point of so many is looked at for the beams: no divisor of their number, or some would be left out."""
 
 
 COVERED_M, _COVERED_SHARE = 1.0, 0.95

@@ -69,7 +69,9 @@ class Verdict(Sink):
         self._before = result
 
     def finish(self, run: RunResult) -> None:
-        """Hand over the verdict."""
+        """Hand over the verdict; a fault of the set-up makes a sound run doubtful."""
+        for fault in run.metrics.get("set_up", ()):
+            self._doubt(fault["kind"], fault["sentence"].removesuffix("."), fault["since_s"])
         run.metrics["verdict"] = self.verdict()
 
     def verdict(self) -> dict[str, Any]:
@@ -121,14 +123,13 @@ class Verdict(Sink):
         self._seen.unmatched_since_s = unmatched if lost else None
 
     def _note_motion(self, result: ScanResult) -> None:
-        if result.motion_error is None:
-            return
-        if result.motion_error > _CONTRADICTED_M:
+        shown = result.shown_motion
+        if shown is not None and shown.error > _CONTRADICTED_M:
             self._seen.contradictions += 1
             self._doubt(
                 "motion",
                 f"at {self._now_s:.1f} s walls and poles show another motion than the estimated one, by "
-                f"{result.motion_error:.1f} m: the scan match follows the scan lines, or the map is wrong",
+                f"{shown.error:.1f} m: the scan match follows the scan lines, or the map is wrong",
             )
 
     def _note_window(self, result: ScanResult) -> None:

@@ -1,7 +1,7 @@
 """A simulated recording as a Sequence: each scan is ray cast when it is asked for."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any
 
@@ -17,13 +17,17 @@ from scipy.spatial.transform import Rotation
 from lio_jax.core.errors import UsageError
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
 from lio_jax.data.trajectory import Trajectory
+from lio_jax.sim.city import city
 from lio_jax.sim.collision import STEP, TOGETHER, check_clear
 from lio_jax.sim.gps import GpsModel, simulate_gps
 from lio_jax.sim.imu import GRAVITY, ImuModel, ImuTruth, simulate_imu
 from lio_jax.sim.lidar import Lidar, Sweep, column_times, firing_times_ns, spinning_lidar, sweep
+from lio_jax.sim.office import office
+from lio_jax.sim.open_worlds import field, room, street
 from lio_jax.sim.sensors import Layout, RosetteLidar, find_sensor
+from lio_jax.sim.stairs import stairs
 from lio_jax.sim.trajectory import Motion, motion_along, motion_through, pose_at
-from lio_jax.sim.world_registry import build
+from lio_jax.sim.tunnel import tunnel
 from lio_jax.sim.worlds import Counts, Part, Scene, World, counts_along, nearest_part
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -35,6 +39,29 @@ _STANDSTILL = 1.5
 """Default time at rest before the body moves off, s."""
 _DURATION = 10.0
 """Default duration of a recording, s."""
+
+
+WORLDS: dict[str, Callable[[int], Scene]] = {
+    "city": city,
+    "field": field,
+    "office": office,
+    "room": room,
+    "stairs": stairs,
+    "street": street,
+    "tunnel": tunnel,
+}
+"""Builders by name: ``builder(seed) -> Scene``."""
+
+
+def build(name: str, seed: int) -> Scene:
+    """Return the world ``name`` (see WORLDS) for the seed ``seed``, with its route.
+
+    Raises:
+        UsageError: there is no such world.
+    """
+    if name not in WORLDS:
+        raise UsageError(f"world '{name}' is unknown; choose one of: {', '.join(sorted(WORLDS))}.")
+    return WORLDS[name](seed)
 
 
 class SimulatedSequence:
@@ -62,7 +89,7 @@ class SimulatedSequence:
         """Build the world and check that the motion is free; no scan is ray cast yet.
 
         Args:
-            world: a name of ``world_registry.WORLDS``, or a scene of your own.
+            world: a name of ``WORLDS``, or a scene of your own.
             sensor: a name of ``sensors.SENSORS``, or a sensor.
             duration_s: length of the recording, s, in whole sweeps. None: the whole ``trajectory``, or 10 s.
             seed: seed of world, motion and noise.

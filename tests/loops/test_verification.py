@@ -14,7 +14,7 @@ from lio_jax.settings.settings import Settings, recipe_settings
 from lio_jax.sim.assembly import assembled
 from lio_jax.sim.blocks import LANE, lap
 from lio_jax.sim.lidar import spinning_lidar
-from lio_jax.sim.world_registry import build
+from lio_jax.sim.sequence import build
 from tests.loops.places import pose
 
 SETTINGS = Settings()

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.types import ImuBatch
-from lio_jax.estimation.params import SmootherParams
+from lio_jax.recipes.lio_sam_params import SmootherParams
 from lio_jax.recipes.smoothed_odometry import drawn_to_tilt, measured_attitude, within_limits
 from tests.params import default_params
 

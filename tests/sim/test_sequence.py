@@ -15,8 +15,7 @@ from lio_jax.sim.gps import GpsModel
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.lidar import ranging, spinning_lidar
 from lio_jax.sim.sensors import SENSORS
-from lio_jax.sim.sequence import EPOCH_NS, SimulatedSequence
-from lio_jax.sim.world_registry import WORLDS
+from lio_jax.sim.sequence import EPOCH_NS, WORLDS, SimulatedSequence
 from lio_jax.sim.worlds import nearest_part
 from tests.sim.surfaces import surface_distance
 

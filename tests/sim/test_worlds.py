@@ -12,8 +12,8 @@ from lio_jax.core.errors import UsageError
 from lio_jax.sim import tunnel
 from lio_jax.sim.open_worlds import BALL, PILLAR, SIZE, START
 from lio_jax.sim.raycast import Hit, cast
+from lio_jax.sim.sequence import WORLDS, build
 from lio_jax.sim.trajectory import motion_along, pose_at
-from lio_jax.sim.world_registry import WORLDS, build
 from lio_jax.sim.worlds import counts_along, nearest_part
 
 REACH = 130.0

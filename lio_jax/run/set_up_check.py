@@ -1,0 +1,388 @@
+"""Names faults of the set-up while a run goes on: extrinsic, clock, axes of the IMU, beams, scan period."""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from lio_jax.core.types import CONVERGED
+from lio_jax.data.sequence import ImuData
+from lio_jax.run.set_up_fit import Equations, Fit, Poses, Samples, SetUp, equations, fitted, solved
+from lio_jax.run.sinks import RunResult, Sink
+from lio_jax.run.track import ScanResult
+from lio_jax.settings.settings import Settings
+
+_SCANS = 20
+"""Number of intervals between the scans of a window."""
+_WINDOWS, _FEWEST = 10, 4
+"""Number of latest windows that are judged together, and the fewest that are."""
+_ROTATION_DEG, _TRANSLATION_M, _CLOCK_S = 2.0, 0.2, 0.012
+"""Smaller errors are not named."""
+_SIGMAS = 8.0
+"""An error is named if it is so many times its standard deviation; residuals are correlated."""
+_LEAST_GAIN = 1.4
+"""The correction has to explain the scans better by this ratio of squared residuals."""
+_TURN_LEFT, _POSITION_LEFT_M = 5e-3, 0.03
+"""Residuals within a window of two seconds that no extrinsic and no clock explain, rad and m."""
+_SHARE_LEFT, _LEAST_TURNING = 0.3, 0.02
+"""Share of the turns that no extrinsic and no clock explain, and the root mean square turn within a window of
+two seconds from which it is judged, rad."""
+_ITERATIONS = 6
+_PAIRS, _LEAST_TURN = 2, 0.04
+"""Number of turns by plan views that are needed, and the smallest one that counts, rad."""
+_RATE_RANGE = (0.8, 1.25)
+"""Range of the gyroscope's turn over the shown one that passes."""
+_PERIODS = 20
+"""Number of scans whose durations are compared with the time between them."""
+_LONG, _SHORT = 1.15, 0.75
+"""Range of the sweep's duration over the time between scans that passes."""
+
+
+_FEW_BEAMS, _FAR_PER_SCAN_M = 10, 0.25
+"""A sensor of so few beams that moves farther than this from scan to scan, m, sees little twice."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault of the set-up."""
+
+    kind: str
+    since_s: float
+    """Time since the first scan at which it was found, s."""
+    sentence: str
+
+
+class SetUpCheck(Sink):
+    """Compares how the scans moved with the inertial samples, in windows of two seconds."""
+
+    def __init__(
+        self, settings: Settings, imu: ImuData | None, notify: Callable[[str], None] | None = None
+    ) -> None:
+        """Begin without scans.
+
+        Args:
+            settings: of the run; the set-up in it is the one that is checked.
+            imu: the samples of the run; None: it uses none.
+            notify: takes each sentence as soon as it is known.
+        """
+        extrinsics = settings.values["extrinsics"]
+        self._assumed = SetUp(
+            Rotation.from_quat(extrinsics["rotation"]),
+            np.array(extrinsics["translation"], np.float64),
+            float(extrinsics["time_offset"]),
+        )
+        self._period_given = "config.data.scan_period" in settings.given
+        self._imu, self._notify = imu, notify
+        self._samples: Samples | None = None
+        self._first_ns = self._last_ns = 0
+        self._now_s = 0.0
+        self._scans: list[_Scan] = []
+        self._windows: deque[tuple[Poses, Equations]] = deque(maxlen=_WINDOWS)
+        self._turns: list[float] = []
+        self._durations: list[float] = []
+        self._intervals: list[float] = []
+        self._ends: deque[float] = deque(maxlen=_SCANS)
+        self._beams = 0
+        self._places: deque[NDArray[np.float64]] = deque(maxlen=_SCANS + 1)
+        self.faults: dict[str, Fault] = {}
+        """Faults by kind, each found once."""
+
+    def take(self, result: ScanResult) -> None:
+        """Add one scan."""
+        if self._samples is None:
+            self._first_ns = self._last_ns = result.stamp_ns
+            self._samples = _samples(self._imu, self._first_ns)
+        self._now_s = (result.stamp_ns - self._first_ns) * 1e-9
+        self._ends.append(self._now_s)
+        self._note_period(result)
+        self._note_beams(result)
+        self._note_turn(result)
+        if len(self._samples.seconds):
+            self._note_pose(result)
+        self._last_ns = result.stamp_ns
+
+    def finish(self, run: RunResult) -> None:
+        """Hand over the faults, from which the verdict takes its reasons."""
+        run.metrics["set_up"] = [
+            {"kind": fault.kind, "since_s": round(fault.since_s, 3), "sentence": fault.sentence}
+            for fault in self.faults.values()
+        ]
+
+    def _found(self, kind: str, sentence: str) -> None:
+        if kind in self.faults:
+            return
+        self.faults[kind] = Fault(kind, self._now_s, sentence)
+        if self._notify is not None:
+            self._notify(sentence)
+
+    def _note_period(self, result: ScanResult) -> None:
+        if not result.duration or result.stamp_ns <= self._last_ns or len(self._durations) >= _PERIODS:
+            return
+        self._durations.append(result.duration)
+        self._intervals.append((result.stamp_ns - self._last_ns) * 1e-9)
+        ratio = self._sweep_ratio()
+        if len(self._durations) == _PERIODS and (ratio > _LONG or (ratio < _SHORT and self._period_given)):
+            self._found("period", self._period_sentence())
+
+    def _sweep_ratio(self) -> float:
+        if not self._durations:
+            return 1.0
+        return float(np.median(self._durations) / np.median(self._intervals))
+
+    def _period_sentence(self) -> str:
+        sweep, interval = np.median(self._durations), np.median(self._intervals)
+        return (
+            f"the points of a scan spread over {sweep:.3f} s, but scans follow each other every "
+            f"{interval:.3f} s: set config.data.scan_period where the recording has no point times, else "
+            "check config.data.time_unit."
+        )
+
+    def _note_beams(self, result: ScanResult) -> None:
+        self._beams = max(self._beams, result.beams or 0)
+        self._places.append(result.T_world_imu[:3, 3])
+        if not 0 < self._beams <= _FEW_BEAMS or len(self._places) <= _SCANS:
+            return
+        moved = float(np.median(np.linalg.norm(np.diff(self._places, axis=0), axis=1)))
+        if moved > _FAR_PER_SCAN_M:
+            self._found(
+                "beams",
+                f"the sensor has {self._beams} beams and moves {moved:.1f} m from scan to scan: too few "
+                "beams for this speed, because a scan hardly meets what the last one saw; drive more slowly, "
+                "or use a sensor of more beams.",
+            )
+
+    def _note_turn(self, result: ScanResult) -> None:
+        """Compare turns about the vertical that plan views show with the gyroscope's."""
+        shown, samples = result.shown_motion, self._samples
+        if shown is None or samples is None or shown.scans >= len(self._ends):
+            return
+        measured = _turn_about_vertical(samples, self._ends[-1 - shown.scans], self._now_s)
+        if measured is None or min(abs(shown.turn), abs(measured)) < _LEAST_TURN:
+            return
+        self._turns.append(measured / shown.turn)
+        wrong = [ratio for ratio in self._turns if not _RATE_RANGE[0] < ratio < _RATE_RANGE[1]]
+        if len(wrong) < _PAIRS or len(wrong) <= len(self._turns) / 2:
+            return
+        ratio = float(np.median(wrong))
+        cause = (
+            "an axis has the wrong sign, or axes are exchanged" if ratio < 0 else "check its unit and axes"
+        )
+        self._found(
+            "axes", f"about the vertical the gyroscope turns {ratio:.1f} times as far as the scans: {cause}."
+        )
+
+    def _note_pose(self, result: ScanResult) -> None:
+        output = result.output
+        matched = int(output.registration.status) == CONVERGED and not bool(output.lost)
+        if not matched or np.asarray(output.registration.degenerate).any() or _is_new_piece(output):
+            self._scans = []
+            return
+        assert self._samples is not None
+        scan = _kept(result, self._samples, self._assumed, self._now_s)
+        if scan is None:
+            return
+        self._scans.append(scan)
+        if len(self._scans) <= _SCANS:
+            return
+        poses, self._scans = _in_the_middle(self._scans, self._assumed), self._scans[-1:]
+        found = equations(poses, self._samples, self._assumed)
+        if found is None:
+            return
+        self._windows.append((poses, found))
+        if len(self._windows) >= _FEWEST:
+            self._judge()
+
+    def _judge(self) -> None:
+        if {"rotation", "translation", "clock", "axes"} & self.faults.keys():
+            return
+        fit = solved([found for _, found in self._windows], self._assumed)
+        set_up = self._assumed.stepped(fit.step)
+        if not self._exceeded(set_up, fit) and not _unexplained(fit):
+            return
+        assert self._samples is not None
+        refined = fitted([poses for poses, _ in self._windows], self._samples, self._assumed, _ITERATIONS)
+        if refined is None:
+            return
+        set_up, last = refined
+        exceeded = self._exceeded(set_up, last._replace(gain=fit.gain))
+        if _unexplained(last):
+            self._found("axes", self._wrong_sign(last) or self._contradiction(last))
+            return
+        # one wrong figure disturbs the others: the one that stands out most is the fault
+        if exceeded:
+            self._found(*max(exceeded)[1:])
+
+    def _exceeded(self, set_up: SetUp, fit: Fit) -> list[tuple[float, str, str]]:
+        """Return for each figure that is wrong: how many times too large it is, its kind, its sentence."""
+        if fit.gain < _LEAST_GAIN:
+            return []
+        sigma = np.sqrt(np.diag(fit.covariance))
+        turn = np.degrees((self._assumed.R_imu_lidar.inv() * set_up.R_imu_lidar).as_rotvec())
+        move = self._assumed.R_imu_lidar.inv().apply(set_up.t_imu_lidar - self._assumed.t_imu_lidar)
+        late = set_up.time_offset - self._assumed.time_offset
+        rows = (
+            ("rotation", turn, np.degrees(sigma[0:3]), _ROTATION_DEG, self._rotation_sentence),
+            ("translation", move, sigma[13:16], _TRANSLATION_M, self._translation_sentence),
+            ("clock", np.array([late]), sigma[6:7], _CLOCK_S, self._clock_sentence),
+        )
+        found = []
+        for kind, error, deviation, least, sentence in rows:
+            size = float(np.linalg.norm(error))
+            along = float(np.linalg.norm(deviation * error) / max(size, 1e-12))
+            if size > max(least, _SIGMAS * along):
+                found.append((size / least, kind, sentence(set_up, size, along)))
+        return found
+
+    def _rotation_sentence(self, set_up: SetUp, size: float, sigma: float) -> str:
+        quaternion = [round(value, 4) + 0.0 for value in set_up.R_imu_lidar.as_quat().tolist()]
+        return (
+            f"scans and inertial samples say that the rotation in T_imu_lidar is wrong by {size:.0f} deg "
+            f"(sigma {sigma:.1f}): set params.extrinsics.rotation to about {quaternion} (xyzw)."
+        )
+
+    def _translation_sentence(self, set_up: SetUp, size: float, sigma: float) -> str:
+        translation = [round(value, 2) + 0.0 for value in set_up.t_imu_lidar.tolist()]
+        return (
+            f"scans and inertial samples say that the translation in T_imu_lidar is wrong by {size:.2f} m "
+            f"(sigma {sigma:.2f}): set params.extrinsics.translation to about {translation} m."
+        )
+
+    def _clock_sentence(self, set_up: SetUp, size: float, sigma: float) -> str:
+        late = set_up.time_offset - self._assumed.time_offset
+        sweep = float(np.median(self._durations)) if self._durations else 0.0
+        period = float(np.median(self._intervals)) if self._intervals else 0.0
+        if self._sweep_ratio() < _SHORT and abs(late - (period - sweep) / 2) < 0.3 * abs(period - sweep):
+            return self._period_sentence()
+        sentence = (
+            f"the clocks of IMU and lidar differ by {late:+.3f} s (sigma {sigma:.3f}) from what was assumed: "
+            f"set params.extrinsics.time_offset={set_up.time_offset:.3f}."
+        )
+        if sweep and abs(abs(late) - sweep) < 0.2 * sweep:
+            end = "end" if late < 0 else "start"
+            sentence += f" That is a sweep: the stamp may mark the scan's {end}, see config.data.stamp_at."
+        return sentence
+
+    def _wrong_sign(self, fit: Fit) -> str | None:
+        """Return a sentence on the axis of the gyroscope whose other sign would explain the turns, if any."""
+        assert self._samples is not None
+        for name, signs in zip("xyz", 1 - 2 * np.eye(3), strict=True):
+            flipped = self._samples._replace(gyro=self._samples.gyro * signs)
+            found = fitted([poses for poses, _ in self._windows], flipped, self._assumed, 2)
+            if found is not None and found[1].turn_left < _SHARE_LEFT * fit.turn_left:
+                return (
+                    f"the gyroscope's {name} axis has the wrong sign: with the other one it turns as the "
+                    "scans do; correct the recorded samples."
+                )
+        return None
+
+    def _contradiction(self, fit: Fit) -> str:
+        return (
+            f"scans and inertial samples contradict each other by {fit.turn_left:.3f} rad and "
+            f"{fit.position_sigma:.2f} m within two seconds, whatever extrinsic and clock: axes, signs or "
+            "units of the IMU are wrong, or the scans are matched wrongly; lio-jax inspect compares them by "
+            "LiDAR odometry alone."
+        )
+
+
+def _unexplained(fit: Fit) -> bool:
+    if fit.turning > _LEAST_TURNING and fit.turn_left > _SHARE_LEFT * fit.turning:
+        return True
+    return fit.turn_sigma > _TURN_LEFT or fit.position_sigma > _POSITION_LEFT_M
+
+
+def _turn_about_vertical(samples: Samples, start: float, end: float) -> float | None:
+    """Return the gyroscope's turn about the mean specific force between two times, rad; None: no samples."""
+    first, last = np.searchsorted(samples.seconds, [start, end]).tolist()
+    up = samples.accel[first:last].sum(axis=0)
+    if last - first < 2 or not np.any(up):
+        return None
+    rate = samples.gyro[first:last].mean(axis=0)
+    return float(rate @ up / np.linalg.norm(up) * (end - start))
+
+
+def _is_new_piece(output: object) -> bool:
+    new_piece = getattr(output, "new_piece", None)
+    return new_piece is not None and bool(new_piece)
+
+
+def _samples(imu: ImuData | None, origin_ns: int) -> Samples:
+    if imu is None:
+        return Samples(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+    seconds = np.asarray((imu.stamp_ns - origin_ns) * 1e-9, np.float64)
+    return Samples(seconds, imu.gyro, imu.accel)
+
+
+class _Scan(NamedTuple):
+    """What is kept of a scan until its window is full."""
+
+    end: float
+    """s since the run's origin, on the lidar's clock."""
+    half: float
+    """Half of the sweep's duration, s."""
+    rate: NDArray[np.float64]
+    """Mean angular rate in the second half of the sweep, (3,) rad/s, IMU axes."""
+    velocity: NDArray[np.float64]
+    """Velocity of the IMU in world, (3,) m/s."""
+    wxyz_xyz: NDArray[np.float64]
+    """T_world_lidar at the end."""
+    information: NDArray[np.float64]
+    """Information of the scan match, (6, 6); zero where the pose itself is that of the match."""
+    gradient: NDArray[np.float64]
+    """Gradient of the match's cost at the pose, (6,)."""
+
+
+def _kept(result: ScanResult, samples: Samples, set_up: SetUp, end: float) -> _Scan | None:
+    """Return what is kept of a scan; None if its sweep is without samples."""
+    half = result.duration / 2
+    edges = [end - half + set_up.time_offset, end + set_up.time_offset]
+    first, last = np.searchsorted(samples.seconds, edges).tolist()
+    if half and first == last:
+        return None
+    nav, evidence = result.nav, result.output.evidence
+    rate = samples.gyro[first:last].mean(axis=0) - nav.gyro_bias if half else np.zeros(3)
+    return _Scan(
+        end,
+        half,
+        rate,
+        np.asarray(nav.velocity, np.float64),
+        np.asarray(result.output.registration.T_world_lidar.wxyz_xyz, np.float64),
+        np.zeros((6, 6)) if evidence is None else np.asarray(evidence.information, np.float64),
+        np.zeros(6) if evidence is None else np.asarray(evidence.gradient, np.float64),
+    )
+
+
+def _in_the_middle(scans: list[_Scan], set_up: SetUp) -> Poses:
+    """Return the lidar's poses in the middles of the sweeps by the scan matches alone.
+
+    There a pose does not depend on the compensation, which would repeat the assumed set-up. A filter's pose
+    lies between prediction and match; the gradient of the match's cost leads back to the match.
+
+    Args:
+        scans: of a window.
+        set_up: as assumed in the compensation.
+    """
+    end, half, rate, velocity, wxyz_xyz, information, gradient = map(np.array, zip(*scans, strict=True))
+    step = _to_the_match(information, gradient)
+    rotation = Rotation.from_rotvec(step[:, :3]) * Rotation.from_quat(wxyz_xyz[:, :4], scalar_first=True)
+    to_lidar = set_up.R_imu_lidar.inv()
+    swing = rotation.apply(to_lidar.apply(np.cross(rate, set_up.t_imu_lidar)))
+    moved = (velocity + swing) * half[:, None]
+    turn = Rotation.from_rotvec(to_lidar.apply(rate) * half[:, None])
+    return Poses(end - half, (rotation * turn.inv()).as_matrix(), wxyz_xyz[:, 4:] + step[:, 3:] - moved)
+
+
+_LEAST_INFORMATION = 1e-4
+"""Directions with a smaller share of the strongest one's information are left where they are."""
+
+
+def _to_the_match(information: NDArray[np.float64], gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the steps (n, 6) from a filter's poses to the minima of the matches' costs, world axes."""
+    values, vectors = np.linalg.eigh(information)
+    strong = values > np.maximum(_LEAST_INFORMATION * values[:, -1:], 1e-300)
+    inverse = np.where(strong, 1 / np.where(strong, values, 1.0), 0.0)
+    along = np.einsum("nij,ni->nj", vectors, gradient)
+    return -np.einsum("nij,nj->ni", vectors, inverse * along)
