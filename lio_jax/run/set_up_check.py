@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,8 @@ _TURN_LEFT, _POSITION_LEFT_M = 5e-3, 0.03
 _SHARE_LEFT, _LEAST_TURNING = 0.3, 0.02
 """Share of the turns that no extrinsic and no clock explain, and the root mean square turn within a window of
 two seconds from which it is judged, rad."""
+_STALE = 0.1
+"""Share of the smallest errors that are named by which an estimated set-up may change unnoticed."""
 _ITERATIONS = 6
 _PAIRS, _LEAST_TURN = 2, 0.04
 """Number of turns by plan views that are needed, and the smallest one that counts, rad."""
@@ -193,11 +195,27 @@ class SetUpCheck(Sink):
         if found is None:
             return
         self._windows.append((poses, found))
+        self._follow_estimate(result.nav)
         if len(self._windows) >= _FEWEST:
             self._judge()
 
+    def _follow_estimate(self, nav: Any) -> None:
+        """Judge the set-up that the filter has found, where it estimates extrinsic or clock."""
+        assert self._samples is not None
+        found = _set_up_of(nav)
+        turn = float(np.degrees((self._assumed.R_imu_lidar.inv() * found.R_imu_lidar).magnitude()))
+        move = float(np.linalg.norm(found.t_imu_lidar - self._assumed.t_imu_lidar))
+        late = abs(found.time_offset - self._assumed.time_offset)
+        if max(turn / _ROTATION_DEG, move / _TRANSLATION_M, late / _CLOCK_S) < _STALE:
+            return
+        self._assumed = found
+        anew = [(poses, equations(poses, self._samples, found)) for poses, _ in self._windows]
+        self._windows.clear()
+        self._windows.extend((poses, found) for poses, found in anew if found is not None)
+
     def _judge(self) -> None:
-        if {"rotation", "translation", "clock", "axes"} & self.faults.keys():
+        # a wrong period looks like another clock, and one wrong figure disturbs the others
+        if self.faults.keys() - {"beams"}:
             return
         fit = solved([found for _, found in self._windows], self._assumed)
         set_up = self._assumed.stepped(fit.step)
@@ -212,7 +230,7 @@ class SetUpCheck(Sink):
         if _unexplained(last):
             self._found("axes", self._wrong_sign(last) or self._contradiction(last))
             return
-        # one wrong figure disturbs the others: the one that stands out most is the fault
+        # the one that stands out most is the fault
         if exceeded:
             self._found(*max(exceeded)[1:])
 
@@ -302,6 +320,12 @@ def _turn_about_vertical(samples: Samples, start: float, end: float) -> float | 
         return None
     rate = samples.gyro[first:last].mean(axis=0)
     return float(rate @ up / np.linalg.norm(up) * (end - start))
+
+
+def _set_up_of(nav: Any) -> SetUp:
+    wxyz_xyz = np.asarray(nav.T_imu_lidar.wxyz_xyz, np.float64)
+    rotation = Rotation.from_quat(wxyz_xyz[:4], scalar_first=True)
+    return SetUp(rotation, wxyz_xyz[4:], float(nav.time_offset))
 
 
 def _is_new_piece(output: object) -> bool:
