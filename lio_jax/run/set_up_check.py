@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.core.types import CONVERGED
 from lio_jax.data.sequence import ImuData
-from lio_jax.run.set_up_fit import Equations, Fit, Poses, Samples, SetUp, equations, fitted, solved
+from lio_jax.run.set_up_fit import SOUGHT, Equations, Fit, Poses, Samples, SetUp, equations, fitted, solved
 from lio_jax.run.sinks import RunResult, Sink
 from lio_jax.run.track import ScanResult
 from lio_jax.settings.settings import Settings
@@ -33,7 +33,9 @@ _SHARE_LEFT, _LEAST_TURNING = 0.3, 0.02
 two seconds from which it is judged, rad."""
 _STALE = 0.1
 """Share of the smallest errors that are named by which an estimated set-up may change unnoticed."""
-_ITERATIONS = 6
+_ITERATIONS = 4
+_PAUSE_S = 5.0
+"""Time after a close look that found no fault to the next one, s."""
 _PAIRS, _LEAST_TURN = 2, 0.04
 """Number of turns by plan views that are needed, and the smallest one that counts, rad."""
 _RATE_RANGE = (0.8, 1.25)
@@ -81,7 +83,7 @@ class SetUpCheck(Sink):
         self._imu, self._notify = imu, notify
         self._samples: Samples | None = None
         self._first_ns = self._last_ns = 0
-        self._now_s = 0.0
+        self._now_s = self._next_s = 0.0
         self._scans: list[_Scan] = []
         self._windows: deque[tuple[Poses, Equations]] = deque(maxlen=_WINDOWS)
         self._turns: list[float] = []
@@ -215,45 +217,44 @@ class SetUpCheck(Sink):
 
     def _judge(self) -> None:
         # a wrong period looks like another clock, and one wrong figure disturbs the others
-        if self.faults.keys() - {"beams"}:
+        if self.faults.keys() - {"beams"} or self._now_s < self._next_s:
             return
         fit = solved([found for _, found in self._windows], self._assumed)
-        set_up = self._assumed.stepped(fit.step)
-        if not self._exceeded(set_up, fit) and not _unexplained(fit):
+        if not _exceeds(self._assumed, self._assumed.stepped(fit.step), fit) and not _unexplained(fit):
             return
-        assert self._samples is not None
-        refined = fitted([poses for poses, _ in self._windows], self._samples, self._assumed, _ITERATIONS)
-        if refined is None:
+        self._next_s = self._now_s + _PAUSE_S
+        # one wrong figure disturbs the others: each is tried alone, and the best explanation counts
+        tried = {name: self._fitted(name) for name in SOUGHT}
+        tried |= {axis: self._fitted(flipped=index) for index, axis in enumerate("xyz")}
+        known = {name: found for name, found in tried.items() if found is not None}
+        if not known:
             return
-        set_up, last = refined
-        exceeded = self._exceeded(set_up, last._replace(gain=fit.gain))
+        best = min(known, key=lambda name: known[name][1].cost)
+        set_up, last = known[best]
         if _unexplained(last):
-            self._found("axes", self._wrong_sign(last) or self._contradiction(last))
-            return
-        # the one that stands out most is the fault
-        if exceeded:
-            self._found(*max(exceeded)[1:])
+            self._found("axes", self._contradiction(last))
+        elif best not in SOUGHT:
+            self._found(
+                "axes",
+                f"the gyroscope's {best} axis has the wrong sign: with the other one it turns as the scans "
+                "do; correct the recorded samples.",
+            )
+        elif exceeded := [row for row in _exceeds(self._assumed, set_up, last) if row[0] == best]:
+            sentences = {
+                "rotation": self._rotation_sentence,
+                "translation": self._translation_sentence,
+                "clock": self._clock_sentence,
+            }
+            self._found(best, sentences[best](set_up, *exceeded[0][1:]))
 
-    def _exceeded(self, set_up: SetUp, fit: Fit) -> list[tuple[float, str, str]]:
-        """Return for each figure that is wrong: how many times too large it is, its kind, its sentence."""
-        if fit.gain < _LEAST_GAIN:
-            return []
-        sigma = np.sqrt(np.diag(fit.covariance))
-        turn = np.degrees((self._assumed.R_imu_lidar.inv() * set_up.R_imu_lidar).as_rotvec())
-        move = self._assumed.R_imu_lidar.inv().apply(set_up.t_imu_lidar - self._assumed.t_imu_lidar)
-        late = set_up.time_offset - self._assumed.time_offset
-        rows = (
-            ("rotation", turn, np.degrees(sigma[0:3]), _ROTATION_DEG, self._rotation_sentence),
-            ("translation", move, sigma[13:16], _TRANSLATION_M, self._translation_sentence),
-            ("clock", np.array([late]), sigma[6:7], _CLOCK_S, self._clock_sentence),
-        )
-        found = []
-        for kind, error, deviation, least, sentence in rows:
-            size = float(np.linalg.norm(error))
-            along = float(np.linalg.norm(deviation * error) / max(size, 1e-12))
-            if size > max(least, _SIGMAS * along):
-                found.append((size / least, kind, sentence(set_up, size, along)))
-        return found
+    def _fitted(self, sought: str | None = None, flipped: int | None = None) -> tuple[SetUp, Fit] | None:
+        """Return the fit of one figure, or with the other sign of an axis of the gyroscope."""
+        samples = self._samples
+        assert samples is not None
+        if flipped is not None:
+            samples = samples._replace(gyro=samples.gyro * (1 - 2 * np.eye(3)[flipped]))
+        poses = [poses for poses, _ in self._windows]
+        return fitted(poses, samples, self._assumed, _ITERATIONS, () if sought is None else (sought,))
 
     def _rotation_sentence(self, set_up: SetUp, size: float, sigma: float) -> str:
         quaternion = [round(value, 4) + 0.0 for value in set_up.R_imu_lidar.as_quat().tolist()]
@@ -284,19 +285,6 @@ class SetUpCheck(Sink):
             sentence += f" That is a sweep: the stamp may mark the scan's {end}, see config.data.stamp_at."
         return sentence
 
-    def _wrong_sign(self, fit: Fit) -> str | None:
-        """Return a sentence on the axis of the gyroscope whose other sign would explain the turns, if any."""
-        assert self._samples is not None
-        for name, signs in zip("xyz", 1 - 2 * np.eye(3), strict=True):
-            flipped = self._samples._replace(gyro=self._samples.gyro * signs)
-            found = fitted([poses for poses, _ in self._windows], flipped, self._assumed, 2)
-            if found is not None and found[1].turn_left < _SHARE_LEFT * fit.turn_left:
-                return (
-                    f"the gyroscope's {name} axis has the wrong sign: with the other one it turns as the "
-                    "scans do; correct the recorded samples."
-                )
-        return None
-
     def _contradiction(self, fit: Fit) -> str:
         return (
             f"scans and inertial samples contradict each other by {fit.turn_left:.3f} rad and "
@@ -304,6 +292,27 @@ class SetUpCheck(Sink):
             "units of the IMU are wrong, or the scans are matched wrongly; lio-jax inspect compares them by "
             "LiDAR odometry alone."
         )
+
+
+def _exceeds(assumed: SetUp, found: SetUp, fit: Fit) -> list[tuple[str, float, float]]:
+    """Return name, size and standard deviation of each figure that is wrong, in deg, m and s."""
+    if fit.gain < _LEAST_GAIN:
+        return []
+    sigma = np.sqrt(np.diag(fit.covariance))
+    turn = np.degrees((assumed.R_imu_lidar.inv() * found.R_imu_lidar).as_rotvec())
+    move = assumed.R_imu_lidar.inv().apply(found.t_imu_lidar - assumed.t_imu_lidar)
+    late = np.array([found.time_offset - assumed.time_offset])
+    rows = []
+    for name, error, unit, least in (
+        ("rotation", turn, 180 / np.pi, _ROTATION_DEG),
+        ("translation", move, 1.0, _TRANSLATION_M),
+        ("clock", late, 1.0, _CLOCK_S),
+    ):
+        size = float(np.linalg.norm(error))
+        along = float(np.linalg.norm(unit * sigma[SOUGHT[name]] * error) / max(size, 1e-12))
+        if size > max(least, _SIGMAS * along):
+            rows.append((name, size, along))
+    return rows
 
 
 def _unexplained(fit: Fit) -> bool:

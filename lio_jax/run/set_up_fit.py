@@ -28,8 +28,10 @@ _PRIOR_SIGMA = np.repeat([3.0, 0.05, 0.5, 0.3, 5.0, 3.0], [3, 3, 1, 3, 3, 3])
 """What is known beforehand, in the order of the parameters: a turn of the extrinsic (rad), the gyroscope's
 bias (rad/s), the clock (s), the accelerometer's bias (m/s^2), gravity (m/s^2) and the lever arm (m). The
 accelerometer's bias alone is known to any use: on level ground it looks like a tilt of the extrinsic."""
-_SET_UP = np.r_[0:3, 6, 13:16]
-"""The parameters of the set-up; biases and gravity differ from run to run."""
+SOUGHT = {"rotation": np.r_[0:3], "translation": np.r_[13:16], "clock": np.r_[6:7]}
+"""The parameters of the set-up by name."""
+_NUISANCE = np.r_[3:6, 7:13]
+"""Biases and gravity, which differ from run to run."""
 _ROUNDS = 6
 """Number of solutions, after each of which a window's residuals tell its noise."""
 _LEAST_TURN_SIGMA, _LEAST_POSITION_SIGMA = 1e-4, 1e-3
@@ -149,6 +151,8 @@ class Fit(NamedTuple):
     """Root mean square of the turns themselves, about each window's mean, rad."""
     turn_left: float
     """Root mean square of what remains of them in all windows, rad."""
+    cost: float
+    """Logarithm of the residuals' likelihood, with the other sign: the best hypothesis has the smallest."""
 
 
 def equations(poses: Poses, samples: Samples, set_up: SetUp) -> Equations | None:
@@ -207,7 +211,7 @@ def equations(poses: Poses, samples: Samples, set_up: SetUp) -> Equations | None
     return Equations(turns, Normal.of(jacobian, residual, line), turning)
 
 
-def solved(windows: Sequence[Equations], at: SetUp) -> Fit:
+def solved(windows: Sequence[Equations], at: SetUp, sought: Sequence[str] = tuple(SOUGHT)) -> Fit:
     """Return the most likely step of the parameters; each window's residuals tell its noise.
 
     A window in which the scans were matched badly thereby loses its weight.
@@ -215,37 +219,53 @@ def solved(windows: Sequence[Equations], at: SetUp) -> Fit:
     Args:
         windows: all linearised at ``at``.
         at: its biases count against what is known of them beforehand.
+        sought: which of "rotation", "translation" and "clock" may change; biases and gravity always may.
     """
     prior = _PRIOR_SIGMA**-2
     known = np.zeros(_SIZE)
     known[_GYRO_BIAS], known[_ACCEL_BIAS] = at.gyro_bias, at.accel_bias
-    free = np.setdiff1d(np.arange(_SIZE), _SET_UP)
+    free = np.concatenate([_NUISANCE, *(SOUGHT[name] for name in sought)])
     parts = [part for window in windows for part in (window.turns, window.positions)]
     matrices, vectors = np.array([part.matrix for part in parts]), np.array([part.vector for part in parts])
+    freedom = np.array([part.freedom for part in parts])
     least = np.tile([_LEAST_TURN_SIGMA, _LEAST_POSITION_SIGMA], len(windows))
     sigmas = np.tile([2e-3, 1e-2], len(windows))
+
+    def solution(weights: Array, free: NDArray[np.intp]) -> tuple[Array, Array]:
+        matrix = (np.tensordot(weights, matrices, 1) + np.diag(prior))[np.ix_(free, free)]
+        step = np.zeros(_SIZE)
+        step[free] = np.linalg.solve(matrix, (weights @ vectors - prior * known)[free])
+        return step, matrix
+
     for _ in range(_ROUNDS):
         weights = sigmas**-2
-        matrix = np.tensordot(weights, matrices, 1) + np.diag(prior)
-        vector = weights @ vectors - prior * known
-        step = np.linalg.solve(matrix, vector)
-        rms = np.array([np.sqrt(part.after(step) / part.freedom) for part in parts])
-        sigmas = np.maximum(rms, least)
-    assumed = np.zeros(_SIZE)
-    assumed[free] = np.linalg.solve(matrix[np.ix_(free, free)], vector[free])
-    before, after = (
-        sum(w * part.after(one) for w, part in zip(weights, parts, strict=True)) for one in (assumed, step)
-    )
+        step, matrix = solution(weights, free)
+        squared = np.array([part.after(step) for part in parts])
+        sigmas = np.maximum(np.sqrt(squared / freedom), least)
+    assumed, _ = solution(weights, _NUISANCE)
+    before = np.array([part.after(assumed) for part in parts])
+    covariance = np.zeros((_SIZE, _SIZE))
+    covariance[np.ix_(free, free)] = np.linalg.inv(matrix)
     turn_sigma, position_sigma = np.median(sigmas.reshape(-1, 2), axis=0).tolist()
-    freedom = sum(window.turns.freedom for window in windows)
-    turning = float(np.sqrt(sum(window.turning for window in windows) / freedom))
-    left = float(np.sqrt(sum(window.turns.after(step) for window in windows) / freedom))
-    gain = float(before / after)
-    return Fit(step, np.linalg.inv(matrix), turn_sigma, position_sigma, gain, turning, left)
+    turns = freedom[::2].sum()
+    return Fit(
+        step=step,
+        covariance=covariance,
+        turn_sigma=turn_sigma,
+        position_sigma=position_sigma,
+        gain=float(weights @ before / (weights @ squared)),
+        turning=float(np.sqrt(sum(window.turning for window in windows) / turns)),
+        turn_left=float(np.sqrt(squared[::2].sum() / turns)),
+        cost=float(freedom @ np.log(sigmas)),
+    )
 
 
 def fitted(
-    windows: Sequence[Poses], samples: Samples, start: SetUp, iterations: int
+    windows: Sequence[Poses],
+    samples: Samples,
+    start: SetUp,
+    iterations: int,
+    sought: Sequence[str] = tuple(SOUGHT),
 ) -> tuple[SetUp, Fit] | None:
     """Return the set-up that explains the windows best, and the last solution; None: samples are missing.
 
@@ -254,16 +274,18 @@ def fitted(
         samples: of the recording.
         start: where to begin.
         iterations: number of linearisations.
+        sought: see :func:`solved`.
     """
-    set_up, fit = start, None
+    set_up, fit, gain = start, None, 1.0
     for _ in range(iterations):
         rows = [one for one in (equations(window, samples, set_up) for window in windows) if one is not None]
         if not rows:
             return None
-        fit = solved(rows, set_up)
-        set_up = set_up.stepped(fit.step)
+        fit = solved(rows, set_up, sought)
+        set_up, gain = set_up.stepped(fit.step), max(gain, fit.gain)
     assert fit is not None
-    return set_up, fit
+    # near the solution the last step gains nothing
+    return set_up, fit._replace(gain=gain)
 
 
 def _knots(samples: Samples, seconds: Array, time_offset: float) -> tuple[Array, Array, Array, Array] | None:
