@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from systems import Pose
 
 from lio_jax.data.sequence import LidarScan, Sequence
+from lio_jax.lidar.params import RingConfig
 from lio_jax.run.fitted_settings import with_sensor_sizes
 from lio_jax.run.run import imu_feed
 from lio_jax.run.scan_inputs import bucket_for
@@ -49,7 +50,11 @@ class LioJaxSystem:
         self._T_imu_lidar = T_imu_lidar
         settings, step = _compiled(T_imu_lidar.tobytes(), recipe, overrides)
         self._config = settings.config.lidar
-        self._pending: LidarScan
+        self._begun = False
+        self._pending: list[LidarScan] = []
+        self._waiting: list[LidarScan] = []
+        self.estimates: list[tuple[int, Pose]] = []
+        """Start stamp and pose of each scan that was answered: the first one with the second."""
         imu = imu_feed(inertial, settings)[0] if inertial is not None else None
         self._results = track(settings, self._feed(), imu, step)
 
@@ -65,18 +70,27 @@ class LioJaxSystem:
         return scan
 
     def register(self, prepared: LidarScan) -> Pose:
-        self._pending = prepared
-        pose: Pose = next(self._results).T_world_imu @ self._T_imu_lidar
+        """Return the latest pose; the first scan, whose result waits for the second, has none yet."""
+        self._pending.append(prepared)
+        self._waiting.append(prepared)
+        if len(self._waiting) == 1 and not self._begun:
+            self._begun = True
+            return np.eye(4)
+        while self._waiting:
+            pose: Pose = next(self._results).T_world_imu @ self._T_imu_lidar
+            self.estimates.append((self._waiting.pop(0).stamp_ns, pose))
         return pose
 
     def _feed(self) -> Iterator[LidarScan]:
         while True:
-            yield self._pending
+            yield self._pending.pop(0)
 
 
 def sizes_for(recipe: str, scans: list[LidarScan]) -> tuple[str, ...]:
     """Return as overrides the sizes that a recipe leaves open and the scans determine."""
     settings = recipe_settings(recipe)
+    if not isinstance(getattr(settings.config, "features", None), RingConfig):
+        return ()
     fitting = with_sensor_sizes(settings, scans)[0].config.features
     return tuple(
         f"config.features.{name}={value}"

@@ -121,7 +121,7 @@ def test_thirty_two_beams_are_recognised_by_their_elevation() -> None:
         (1.99, 0),
         (1.5, 2),
         (0.0, 6),
-        (-8.5, 32),
+        (-8.55, 32),
         (-8.8, 32),
         (-9.0, 32),
         (-10.0, 34),
