@@ -20,6 +20,14 @@ FINE = 0.25
 """Distance between two displacements that are tried, m."""
 _PEAK, _APART = 0.8, 1.2
 """Displacements nearer to the best one belong to it; farther ones are rivals, m."""
+_FEWEST = 8
+"""So few votes may come from one vehicle that moves along."""
+_FINE_CELL, _FINE_STEP, _FINE_REACH = 0.1, 0.05, 0.35
+"""Edge length of a cell, distance between displacements and largest correction where one is refined, m."""
+_ABOVE_GROUND = 0.3
+"""Points lower than this above their cell's lowest one are left out there: scan lines on the ground, m."""
+_REFINED_POINTS = 3000
+"""A displacement is refined with about so many points."""
 
 
 class PlanView(NamedTuple):
@@ -29,15 +37,8 @@ class PlanView(NamedTuple):
     """(n, n) True where something stands; the sensor is in the middle."""
     centers: NDArray[np.float32]
     """(k, 2) mean positions of the points of these cells, m, level axes."""
-
-    def turned(self, angle: float) -> NDArray[np.float32]:
-        """Return the centers after a turn about the vertical, (k, 2) m.
-
-        Args:
-            angle: rad.
-        """
-        cos, sin = np.cos(angle), np.sin(angle)
-        return self.centers @ np.array([[cos, sin], [-sin, cos]], np.float32)
+    points: NDArray[np.float32]
+    """(m, 2) positions of the points above the ground in these cells, m, level axes."""
 
 
 class Displacement(NamedTuple):
@@ -55,12 +56,18 @@ class Displacement(NamedTuple):
     @property
     def is_certain(self) -> bool:
         """Return whether no rival explains the views nearly as well."""
-        return self.share > 0.5 and self.votes - self.votes_of_rival > self.least_lead
+        return self.votes > _FEWEST and self.share > 0.5 and leads(self.votes, self.votes_of_rival)
 
-    @property
-    def least_lead(self) -> float:
-        """Number of votes by which the best displacement has to lead."""
-        return max(3 * self.votes**0.5, 0.15 * self.votes)
+
+def leads(votes: int, rival: int) -> bool:
+    """Return whether chance does not explain by how many votes one displacement leads another."""
+    return votes - rival > max(2.5 * (2 * rival + 2) ** 0.5, 0.15 * votes)
+
+
+def turn(angle: float) -> NDArray[np.float32]:
+    """Return the (2, 2) matrix that turns (k, 2) positions on its left about the vertical, rad."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, sin], [-sin, cos]], np.float32)
 
 
 def plan_view(points: NDArray[np.float32]) -> PlanView:
@@ -71,19 +78,21 @@ def plan_view(points: NDArray[np.float32]) -> PlanView:
     """
     horizontal = np.hypot(points[:, 0], points[:, 1])
     points = points[(horizontal > _NEAREST) & (horizontal < _FARTHEST)]
-    occupied = np.zeros((_WIDTH, _WIDTH), np.bool_)
+    width = _width(CELL)
+    occupied = np.zeros((width, width), np.bool_)
     if not len(points):
-        return PlanView(occupied, np.zeros((0, 2), np.float32))
-    cell = _cell_of(points[:, :2])
+        return PlanView(occupied, points[:, :2], points[:, :2])
+    cell = _cell_of(points[:, :2], CELL)
     order = np.argsort(cell, kind="stable")
     cell, points = cell[order], points[order]
     first = np.flatnonzero(np.diff(cell, prepend=-1))
-    height = np.maximum.reduceat(points[:, 2], first) - np.minimum.reduceat(points[:, 2], first)
+    lowest = np.minimum.reduceat(points[:, 2], first)
     count = np.diff(first, append=len(points))
     centers = np.add.reduceat(points[:, :2], first) / count[:, None]
-    upright = height > _UPRIGHT
+    upright = np.maximum.reduceat(points[:, 2], first) - lowest > _UPRIGHT
     occupied.ravel()[cell[first][upright]] = True
-    return PlanView(occupied, centers[upright].astype(np.float32))
+    stands = np.repeat(upright, count) & (points[:, 2] > np.repeat(lowest + _ABOVE_GROUND, count))
+    return PlanView(occupied, centers[upright].astype(np.float32), points[stands, :2])
 
 
 def displacement(
@@ -97,13 +106,8 @@ def displacement(
         reach: longest displacement to try, m; at most 20 m is tried.
         step: distance between two displacements that are tried, m.
     """
-    steps = int(min(reach, _LONGEST) / step)
-    axis = np.arange(-steps, steps + 1) * step
-    tried = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
-    length = np.linalg.norm(tried, axis=1)
-    tried, length = tried[length <= reach + 1e-9], length[length <= reach + 1e-9]
-    moved = centers + tried[:, None].astype(np.float32)
-    votes = first.occupied.ravel()[_cell_of(moved)].sum(axis=1)
+    tried = _disc(min(reach, _LONGEST), step)
+    votes = _votes(first.occupied, CELL, centers, tried)
     best = int(np.argmax(votes))
     apart = np.linalg.norm(tried - tried[best], axis=1)
     peak = (apart <= _PEAK) & (votes >= 0.9 * votes[best])
@@ -115,12 +119,51 @@ def displacement(
     )
 
 
+def refined(first: PlanView, points: NDArray[np.float32], shift: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a displacement (2,), m, moved to where most points meet others; its precision is about 0.03 m.
+
+    Args:
+        first: the view from the first position.
+        points: (m, 2) those of the view from the second position, in the same axes, m.
+        shift: (2,) the displacement with the most votes by cells, m.
+    """
+    width = _width(_FINE_CELL)
+    occupied = np.zeros((width, width), np.bool_)
+    occupied.ravel()[_cell_of(first.points, _FINE_CELL)] = True
+    tried = shift + _disc(_FINE_REACH, _FINE_STEP)
+    votes = _votes(occupied, _FINE_CELL, points[:: max(1, len(points) // _REFINED_POINTS)], tried)
+    weights = np.maximum(votes - 0.8 * votes.max(), 0)
+    found: NDArray[np.float64] = np.average(tried, axis=0, weights=weights) if weights.any() else shift
+    return found
+
+
+def _disc(radius: float, step: float) -> NDArray[np.float64]:
+    """Return the (n, 2) displacements of a square grid that are not longer than a radius, m."""
+    steps = int(radius / step + 1e-9)
+    axis = np.arange(-steps, steps + 1) * step
+    all_of_them = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    return all_of_them[np.linalg.norm(all_of_them, axis=1) <= radius + 1e-9]
+
+
+def _votes(
+    occupied: NDArray[np.bool_], cell: float, positions: NDArray[np.float32], tried: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Return how many of the (k, 2) positions each of the (n, 2) displacements moves into occupied cells."""
+    moved = positions + tried[:, None].astype(np.float32)
+    counted: NDArray[np.int64] = occupied.ravel()[_cell_of(moved, cell)].sum(axis=1)
+    return counted
+
+
 _LONGEST = 20.0
-_WIDTH = int(2 * (_FARTHEST + _LONGEST) / CELL) + 2
-"""Number of cells along an edge of the grid: no displaced point falls outside."""
 
 
-def _cell_of(positions: NDArray[np.float32]) -> NDArray[np.int32]:
+def _width(cell: float) -> int:
+    """Return the number of cells along an edge of the grid: no displaced point falls outside."""
+    return int(2 * (_FARTHEST + _LONGEST) / cell) + 2
+
+
+def _cell_of(positions: NDArray[np.float32], cell: float) -> NDArray[np.int32]:
     """Return the number of the cell of each (..., 2) position."""
-    index = np.floor(positions / np.float32(CELL)).astype(np.int32) + _WIDTH // 2
-    return index[..., 0] * _WIDTH + index[..., 1]
+    width = _width(cell)
+    index = np.floor(positions / np.float32(cell)).astype(np.int32) + width // 2
+    return index[..., 0] * width + index[..., 1]

@@ -164,7 +164,9 @@ class SetUpCheck(Sink):
         shown, samples = result.shown_motion, self._samples
         if shown is None or samples is None or shown.scans >= len(self._ends):
             return
-        measured = _turn_about_vertical(samples, self._ends[-1 - shown.scans], self._now_s)
+        # in a bend the accelerometers' mean does not point up
+        up = result.T_world_imu[2, :3]
+        measured = _turn_about(up, samples, self._ends[-1 - shown.scans], self._now_s)
         if measured is None or min(abs(shown.turn), abs(measured)) < _LEAST_TURN:
             return
         self._turns.append(measured / shown.turn)
@@ -321,14 +323,19 @@ def _unexplained(fit: Fit) -> bool:
     return fit.turn_sigma > _TURN_LEFT or fit.position_sigma > _POSITION_LEFT_M
 
 
-def _turn_about_vertical(samples: Samples, start: float, end: float) -> float | None:
-    """Return the gyroscope's turn about the mean specific force between two times, rad; None: no samples."""
+def _turn_about(axis: NDArray[np.float64], samples: Samples, start: float, end: float) -> float | None:
+    """Return the gyroscope's turn about an axis between two times, rad; None: there are no samples.
+
+    Args:
+        axis: (3,) unit vector, IMU frame.
+        samples: all of the run.
+        start: s since the run's origin.
+        end: s since the run's origin.
+    """
     first, last = np.searchsorted(samples.seconds, [start, end]).tolist()
-    up = samples.accel[first:last].sum(axis=0)
-    if last - first < 2 or not np.any(up):
+    if last - first < 2:
         return None
-    rate = samples.gyro[first:last].mean(axis=0)
-    return float(rate @ up / np.linalg.norm(up) * (end - start))
+    return float(samples.gyro[first:last].mean(axis=0) @ axis * (end - start))
 
 
 def _set_up_of(nav: Any) -> SetUp:

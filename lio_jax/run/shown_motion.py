@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.types import ImuBatch, Scan
-from lio_jax.lidar.plan_view import Displacement, PlanView, displacement, plan_view
+from lio_jax.lidar.plan_view import (
+    FINE,
+    Displacement,
+    PlanView,
+    displacement,
+    leads,
+    plan_view,
+    refined,
+    turn,
+)
 
 _FASTEST = 45.0
 """Largest speed that is tried, m/s."""
@@ -23,7 +32,7 @@ _LONGEST_INTERVAL = 0.5
 _TURNS = np.arange(-10, 11) * 0.01
 """Turns about the vertical between the two scans that are tried where no gyroscope shows the turn, rad."""
 _COARSELY = 250
-"""Number of cells with which these turns are compared."""
+"""Number of cells with which these turns are compared; views of fewer cells are compared in finer steps."""
 _PIECES = 20
 """Number of pieces into which the time between the scans is cut to integrate the angular rate."""
 
@@ -36,7 +45,7 @@ def first_velocity(
     between: ImuBatch | None,
     R_imu_lidar: Rotation,
 ) -> NDArray[np.float64] | None:
-    """Return the lidar's velocity at the first scan's end, (3,) m/s along the IMU's axes, to about 1 m/s.
+    """Return the lidar's velocity at the first scan's end, (3,) m/s along the IMU's axes, to about 0.3 m/s.
 
     None: the vehicle is slower than 2 m/s, or the scans do not show a speed without doubt.
 
@@ -53,19 +62,20 @@ def first_velocity(
     clouds = _points(first), _points(second)
     level, view = _levelled(clouds[0], before, R_imu_lidar)
     measured = _turn(between, float(second.duration), interval)
-    turn = R_imu_lidar.inv() * (measured or Rotation.identity()) * R_imu_lidar
-    seen = plan_view(_turned(clouds[1], level * turn))
+    turned = R_imu_lidar.inv() * (measured or Rotation.identity()) * R_imu_lidar
+    seen = plan_view(_turned(clouds[1], level * turned))
     if measured is None:
         angle = max(_TURNS, key=lambda angle: _compared(view, seen, angle, interval, _COARSELY).votes)
-        turn = level.inv() * Rotation.from_rotvec([0.0, 0.0, angle]) * level
+        turned = level.inv() * Rotation.from_rotvec([0.0, 0.0, angle]) * level
     else:
         angle = 0.0
     found = _compared(view, seen, angle, interval)
     if not found.is_certain:
         return None
+    shift = refined(view, seen.points @ turn(angle), found.shift)
     # the velocity stays in the body's own axes: the way points along the mean heading
-    half = Rotation.from_rotvec(turn.as_rotvec() / 2)
-    way = half.inv().apply(level.inv().apply([*found.shift, 0.0]))
+    half = Rotation.from_rotvec(turned.as_rotvec() / 2)
+    way = half.inv().apply(level.inv().apply([*shift, 0.0]))
     velocity: NDArray[np.float64] = R_imu_lidar.apply(way) / interval
     return velocity if np.linalg.norm(velocity) > _SLOWEST else None
 
@@ -116,7 +126,7 @@ def _compared(
     view: PlanView, seen: PlanView, angle: float, interval: float, most: int | None = None
 ) -> Displacement:
     """Return the displacement between two views, the second one turned; at most ``most`` cells are used."""
-    centers = seen.turned(angle)
+    centers = seen.centers @ turn(angle)
     every = 1 if most is None else -(-max(len(centers), 1) // most)
     return displacement(view, centers[::every], _FASTEST * interval)
 
@@ -159,6 +169,8 @@ class ShownMotion(NamedTuple):
 
     error: float
     """Distance by which the estimate misplaces what stands 15 m away, m."""
+    way: float
+    """Distance between the two positions that the plan views show, m."""
     turn: float
     """Turn about the vertical that the plan views show, rad."""
     scans: int
@@ -223,22 +235,26 @@ def _shown(
     moved = (T_world_lidar - reference.T_world_lidar)[:2, 3].astype(np.float32)
     if np.linalg.norm(moved) > _FAR:
         return None
-    turn = _turn_about_vertical(reference.T_world_lidar, T_world_lidar)
-    as_estimated = displacement(reference.view, view.centers + moved, _REACH, _STEP)
-    if as_estimated.is_certain:
-        return ShownMotion(float(np.linalg.norm(as_estimated.shift)), turn, scans)
-    every = max(1, len(view.centers) // _COARSELY)
+    estimated = _turn_about_vertical(reference.T_world_lidar, T_world_lidar)
+    step = FINE if len(view.centers) < _COARSELY else _STEP
 
-    def votes(angle: float) -> int:
-        return displacement(reference.view, view.turned(angle)[::every] + moved, _REACH, _STEP).votes
+    def compared(angle: float, every: int = 1) -> Displacement:
+        centers = (view.centers @ turn(angle))[::every]
+        return displacement(reference.view, centers + moved, _REACH, step)
 
-    angle = max(_TURN_ERRORS, key=votes)
-    turned = displacement(reference.view, view.turned(angle) + moved, _REACH, _STEP)
-    lead = turned.votes - as_estimated.votes
-    if not turned.is_certain or abs(angle) < _LEAST_TURN_ERROR or lead < turned.least_lead:
-        return None
-    error = float(np.linalg.norm(turned.shift)) + _ARM * abs(float(angle))
-    return ShownMotion(error, turn + float(angle), scans)
+    found, angle = compared(0.0), 0.0
+    if not found.is_certain:
+        every = max(1, len(view.centers) // _COARSELY)
+        angle = float(max(_TURN_ERRORS, key=lambda one: compared(one, every).votes))
+        straight, found = found.votes, compared(angle)
+        is_turned = abs(angle) >= _LEAST_TURN_ERROR
+        if not found.is_certain or (is_turned and not leads(found.votes, straight)):
+            return None
+    shift = refined(reference.view, view.points @ turn(angle) + moved, found.shift)
+    error, way = float(np.linalg.norm(shift)), float(np.linalg.norm(moved + shift))
+    if abs(angle) < _LEAST_TURN_ERROR:
+        return ShownMotion(error, way, estimated, scans)
+    return ShownMotion(error + _ARM * abs(angle), way, estimated + angle, scans)
 
 
 def _turn_about_vertical(before: NDArray[np.float64], after: NDArray[np.float64]) -> float:

@@ -14,9 +14,9 @@ from lio_jax.settings.settings import Settings
 
 TOLERATED_M, TOLERATED_SHARE = 1.0, 0.05
 """An error above this distance, m, or above this share of the way, makes a trajectory doubtful."""
-_CONTRADICTED_M = 1.2
-"""Error of the motion against the plan view that counts, m: the plan view is never wrong by this when it is
-certain."""
+_CONTRADICTED_M = 0.3
+"""Error of the motion against the plan view that counts, m; of a long way the tolerated share counts, up to
+the tolerated distance. Where a plan view is certain it is right to 0.2 m."""
 _WINDOW = 20
 """Number of scans over which convergence and the normalised innovation are averaged."""
 _UNCONVERGED = 0.5
@@ -124,8 +124,10 @@ class Verdict(Sink):
 
     def _note_motion(self, result: ScanResult) -> None:
         shown = result.shown_motion
-        if shown is not None and shown.error > _CONTRADICTED_M:
-            self._seen.contradictions += 1
+        if shown is None:
+            return
+        if shown.error > min(max(_CONTRADICTED_M, TOLERATED_SHARE * shown.way), TOLERATED_M):
+            self._seen.contradictions += shown.error > TOLERATED_M
             self._doubt(
                 "motion",
                 f"at {self._now_s:.1f} s walls and poles show another motion than the estimated one, by "

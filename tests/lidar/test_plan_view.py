@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lio_jax.lidar.plan_view import displacement, plan_view
+from lio_jax.lidar.plan_view import displacement, plan_view, refined, turn
 
 REACH = 4.5
 
@@ -35,6 +35,7 @@ def test_the_displacement_is_that_of_the_poles(moved):
     found = displacement(first, second.centers, REACH)
     assert found.is_certain
     np.testing.assert_allclose(found.shift, moved, atol=0.3)
+    np.testing.assert_allclose(refined(first, second.points, found.shift), moved, atol=0.03)
 
 
 def test_ground_alone_shows_no_displacement():
@@ -51,12 +52,28 @@ def test_a_wall_along_the_way_shows_no_displacement():
     assert not displacement(view, view.centers, REACH).is_certain
 
 
-def test_a_turn_of_the_view_turns_its_centers():
-    view = plan_view(seen(poles(2), (0, 0)))
-    cos, sin = np.cos(0.3), np.sin(0.3)
-    np.testing.assert_allclose(
-        view.turned(0.3), view.centers @ np.array([[cos, -sin], [sin, cos]]).T, atol=1e-5
-    )
+def test_a_dozen_poles_suffice():
+    places = poles(3, 12)
+    first, second = plan_view(seen(places, (0, 0))), plan_view(seen(places, (0.5, 0.0)))
+    found = displacement(first, second.centers, REACH)
+    assert found.is_certain
+    np.testing.assert_allclose(refined(first, second.points, found.shift), [0.5, 0.0], atol=0.03)
+
+
+def test_different_poles_show_no_displacement():
+    for seed in range(20):
+        first, second = (plan_view(seen(poles(one), (0, 0))) for one in (seed, seed + 100))
+        assert not displacement(first, second.centers, REACH).is_certain
+
+
+def test_a_view_is_turned_about_the_vertical():
+    angle = 0.3
+    places = poles(2)
+    first = plan_view(seen(places, (0, 0)))
+    back = plan_view(seen(places @ turn(-angle), (0, 0)))
+    found = displacement(first, back.centers @ turn(angle), REACH)
+    assert found.is_certain
+    np.testing.assert_allclose(refined(first, back.points @ turn(angle), found.shift), 0.0, atol=0.05)
 
 
 def test_an_empty_scan_has_an_empty_view():

@@ -20,6 +20,7 @@ from lio_jax.run.verdict import Verdict
 from lio_jax.settings.settings import recipe_settings, with_overrides
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
+from tests.run.roads import road, tracked
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
@@ -225,3 +226,15 @@ def test_a_run_states_the_fault_in_its_folder(tmp_path, capsys):
     assert fault["sentence"] in printed
     assert metrics["verdict"]["state"] == "doubtful"
     assert yaml.safe_load((out / "config.yaml").read_text())["params"]["extrinsics"]["time_offset"] == 0.06
+
+
+def test_a_bend_at_speed_is_no_fault_of_the_gyroscope():
+    # the accelerometers' mean leans by 50 degrees there
+    sequence = road("street", 25.0, 0.5, 30)
+    settings, results = tracked(sequence, "default")
+    imu, _ = imu_feed(sequence, settings)
+    check = SetUpCheck(settings, imu.samples)
+    for one in results:
+        check.take(one)
+    assert sum(one.shown_motion is not None for one in results) >= 4
+    assert not check.faults

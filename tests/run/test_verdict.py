@@ -1,11 +1,14 @@
 """A run ends with a verdict: sound, doubtful or lost, with the reason."""
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from lio_jax.cli import main
 from lio_jax.data.detect import open_sequence
+from lio_jax.run.shown_motion import ShownMotion
 from lio_jax.run.verdict import Verdict, in_words
 from tests.run.roads import relative, road, steps, tracked
 from tests.run.test_first_velocity import DRIVE
@@ -40,6 +43,25 @@ def test_a_real_drive_that_is_taken_for_standing_is_lost(recipe):
     sequence = open_sequence(DRIVE)
     found = verdict_of(*tracked(sequence, recipe, [AT_REST], scans=sequence.scans(0, 20)))
     assert (found["state"], found["since_s"] < 0.3) == ("lost", True)
+
+
+def test_an_error_of_more_than_five_percent_of_the_way_is_noticed():
+    sequence = road("motorway", 5.0, 0.5, 12)
+    settings, results = tracked(sequence, "loam", [AT_REST])
+    poses, truth = relative(results, sequence)
+    error = np.linalg.norm(poses[-1, :3, 3] - truth[-1, :3, 3])
+    assert 0.05 * steps(truth).sum() < error
+    assert verdict_of(settings, results)["state"] != "sound"
+
+
+@pytest.mark.parametrize(
+    ("error", "way", "state"),
+    [(0.2, 0.5, "sound"), (0.4, 0.5, "doubtful"), (0.4, 12.0, "sound"), (1.1, 40.0, "lost")],
+)
+def test_how_wrong_a_motion_may_be_depends_on_the_way(error, way, state):
+    settings, results = tracked(road("street", 25.0, 0.0, 8), "default")
+    seen = replace(results[-1], shown_motion=ShownMotion(error, way, 0.0, 3))
+    assert verdict_of(settings, [*results[:-2], seen, seen])["state"] == state
 
 
 @pytest.mark.parametrize("recipe", ["default", "fast_lio2", "lio_sam", "loam"])
