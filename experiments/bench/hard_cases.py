@@ -222,7 +222,7 @@ SCENES: dict[str, dict[str, Any]] = {
     "8 beams in a street": {"world": "street", "beams": 8},
     "8 beams in a city": {"world": "city", "beams": 8},
     "tunnel": {"world": "tunnel"},
-    "office by hand": {"world": "office"},
+    "office by hand, 4 rad/s": {"world": "office", "swing_rate": 4.0},
 }
 """Arguments of the simulator."""
 

@@ -119,6 +119,7 @@ def _sequence(
         gps=gps if sensors.gps_rate else None,
         standstill_s=motion.standstill,
         moving_start=motion.moving_start,
+        swing_rate=motion.swing_rate,
         trajectory=_trajectory(motion.trajectory),
         T_imu_lidar=_extrinsic(sensors),
     )

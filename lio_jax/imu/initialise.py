@@ -38,7 +38,7 @@ STILL_MISFIT = 0.05
 MOVING_ACCEL = 1.0
 """Standard deviation of a moving vehicle's mean acceleration over about a second, m/s^2."""
 MOVING_SPEED = 10.0
-"""Standard deviation of a moving vehicle's first velocity per axis, m/s."""
+"""Standard deviation of a moving vehicle's first velocity per axis where it is unknown, m/s."""
 _UNKNOWN_TILT = 1.0
 """Prior standard deviation of roll and pitch, before the specific force is used, rad."""
 
@@ -152,7 +152,8 @@ def levelled(up: Float[Array, "3"]) -> jaxlie.SO3:
 
 def _prior(nav: NavState, initial: InitialParams, is_still: Bool[Array, ""]) -> Float[Array, "24 24"]:
     """Return the prior covariance of the error state: tilt unknown, heading fixed."""
-    velocity = jnp.where(is_still, initial.velocity_sigma, jnp.hypot(initial.velocity_sigma, MOVING_SPEED))
+    is_known = is_still | jnp.any(initial.velocity != 0)
+    velocity = jnp.where(is_known, initial.velocity_sigma, jnp.hypot(initial.velocity_sigma, MOVING_SPEED))
     parts = (
         (VELOCITY, velocity),
         (GYRO_BIAS, initial.gyro_bias_sigma),

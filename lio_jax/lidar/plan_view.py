@@ -20,6 +20,8 @@ FINE = 0.25
 """Distance between two displacements that are tried, m."""
 _PEAK, _APART = 0.8, 1.2
 """Displacements nearer to the best one belong to it; farther ones are rivals, m."""
+_CLEAR_REACH = 3.0
+"""Displacements up to this one have to show in a view, m."""
 _FEWEST = 8
 """So few votes may come from one vehicle that moves along."""
 _FINE_CELL, _FINE_STEP, _FINE_REACH = 0.1, 0.05, 0.35
@@ -50,18 +52,29 @@ class Displacement(NamedTuple):
     """Number of cells of the second view that are occupied in the first view after the displacement."""
     share: float
     """The same over the number of all cells of the second view."""
-    votes_of_rival: int
-    """Largest number of votes of a displacement that is more than 1.2 m from the best one."""
+    own_votes: int
+    """Number of cells that vote for this displacement and not for its strongest rival, which is the
+    displacement with the most votes of those more than 1.2 m away."""
+    rival_votes: int
+    """Number of cells that vote for that rival and not for this displacement."""
 
     @property
     def is_certain(self) -> bool:
         """Return whether no rival explains the views nearly as well."""
-        return self.votes > _FEWEST and self.share > 0.5 and leads(self.votes, self.votes_of_rival)
+        # cells of a wall along the way vote for both, and say nothing
+        lead = self.own_votes - self.rival_votes
+        is_seen = self.votes > _FEWEST and self.share > 0.5
+        return is_seen and lead > 0.15 * self.votes and leads(self.own_votes, self.rival_votes)
+
+
+def shows_motion(view: PlanView) -> bool:
+    """Return whether a plan view shows any displacement: in a tunnel or on a plain it does not."""
+    return displacement(view, view.centers, _CLEAR_REACH, CELL).is_certain
 
 
 def leads(votes: int, rival: int) -> bool:
     """Return whether chance does not explain by how many votes one displacement leads another."""
-    return votes - rival > max(2.5 * (2 * rival + 2) ** 0.5, 0.15 * votes)
+    return votes - rival > 2.5 * (2 * rival + 2) ** 0.5
 
 
 def turn(angle: float) -> NDArray[np.float32]:
@@ -103,19 +116,22 @@ def displacement(
     Args:
         first: the view from the first position.
         centers: (k, 2) those of the view from the second position, in the same axes, m.
-        reach: longest displacement to try, m; at most 20 m is tried.
+        reach: longest displacement to try, m, above 1.2 m; at most 20 m is tried.
         step: distance between two displacements that are tried, m.
     """
     tried = _disc(min(reach, _LONGEST), step)
-    votes = _votes(first.occupied, CELL, centers, tried)
+    votes = _hits(first.occupied, CELL, centers, tried).sum(axis=1)
     best = int(np.argmax(votes))
     apart = np.linalg.norm(tried - tried[best], axis=1)
     peak = (apart <= _PEAK) & (votes >= 0.9 * votes[best])
+    rival = int(np.argmax(np.where(apart > _APART, votes, -1)))
+    of_best, of_rival = _hits(first.occupied, CELL, centers, tried[[best, rival]])
     return Displacement(
         shift=np.average(tried[peak], axis=0, weights=np.maximum(votes[peak], 1)),
         votes=int(votes[best]),
         share=float(votes[best] / max(len(centers), 1)),
-        votes_of_rival=int(votes[apart > _APART].max(initial=0)),
+        own_votes=int(np.count_nonzero(of_best & ~of_rival)),
+        rival_votes=int(np.count_nonzero(of_rival & ~of_best)),
     )
 
 
@@ -131,7 +147,8 @@ def refined(first: PlanView, points: NDArray[np.float32], shift: NDArray[np.floa
     occupied = np.zeros((width, width), np.bool_)
     occupied.ravel()[_cell_of(first.points, _FINE_CELL)] = True
     tried = shift + _disc(_FINE_REACH, _FINE_STEP)
-    votes = _votes(occupied, _FINE_CELL, points[:: max(1, len(points) // _REFINED_POINTS)], tried)
+    some = points[:: max(1, len(points) // _REFINED_POINTS)]
+    votes = _hits(occupied, _FINE_CELL, some, tried).sum(axis=1)
     weights = np.maximum(votes - 0.8 * votes.max(), 0)
     found: NDArray[np.float64] = np.average(tried, axis=0, weights=weights) if weights.any() else shift
     return found
@@ -145,13 +162,13 @@ def _disc(radius: float, step: float) -> NDArray[np.float64]:
     return all_of_them[np.linalg.norm(all_of_them, axis=1) <= radius + 1e-9]
 
 
-def _votes(
+def _hits(
     occupied: NDArray[np.bool_], cell: float, positions: NDArray[np.float32], tried: NDArray[np.float64]
-) -> NDArray[np.int64]:
-    """Return how many of the (k, 2) positions each of the (n, 2) displacements moves into occupied cells."""
+) -> NDArray[np.bool_]:
+    """Return (n, k) which of (k, 2) positions each of (n, 2) displacements moves into occupied cells."""
     moved = positions + tried[:, None].astype(np.float32)
-    counted: NDArray[np.int64] = occupied.ravel()[_cell_of(moved, cell)].sum(axis=1)
-    return counted
+    hits: NDArray[np.bool_] = occupied.ravel()[_cell_of(moved, cell)]
+    return hits
 
 
 _LONGEST = 20.0

@@ -205,7 +205,7 @@ def reopened(
 
 
 def with_first_velocity(params: Any, velocity: NDArray[np.float64] | None) -> Any:
-    """Return params, or those of a transformed recipe, with another ``initial.velocity``.
+    """Return params, or those of a transformed recipe, that start with a velocity that two scans show.
 
     Args:
         params: a recipe's, those of a batch, or a :class:`Dual`.
@@ -216,8 +216,13 @@ def with_first_velocity(params: Any, velocity: NDArray[np.float64] | None) -> An
     if isinstance(params, Dual):
         return Dual(with_first_velocity(params.value, velocity), params.dot)
     leaf = params.initial.velocity
-    return eqx.tree_at(
-        lambda one: one.initial.velocity,
-        params,
-        jnp.broadcast_to(jnp.asarray(velocity, leaf.dtype), leaf.shape),
-    )
+    shown = jnp.broadcast_to(jnp.asarray(velocity, leaf.dtype), leaf.shape)
+    params = eqx.tree_at(lambda one: one.initial.velocity, params, shown)
+    if not hasattr(params.initial, "velocity_sigma"):
+        return params
+    sigma = jnp.minimum(params.initial.velocity_sigma, _SHOWN_SIGMA)
+    return eqx.tree_at(lambda one: one.initial.velocity_sigma, params, sigma)
+
+
+_SHOWN_SIGMA = 0.3
+"""Standard deviation of a velocity that the plan views of two scans show, m/s."""

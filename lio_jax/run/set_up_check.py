@@ -46,7 +46,9 @@ _LONG, _SHORT = 1.15, 0.75
 """Range of the sweep's duration over the time between scans that passes."""
 
 
-_FEW_BEAMS, _FAR_PER_SCAN_M = 10, 0.25
+_MOVES = 5
+"""Number of moves from scan to scan whose median counts."""
+_FEW_BEAMS, _FAR_PER_SCAN_M = 10, 0.2
 """A sensor of so few beams that moves farther than this from scan to scan, m, sees little twice."""
 
 
@@ -91,7 +93,7 @@ class SetUpCheck(Sink):
         self._intervals: list[float] = []
         self._ends: deque[float] = deque(maxlen=_SCANS)
         self._beams = 0
-        self._places: deque[NDArray[np.float64]] = deque(maxlen=_SCANS + 1)
+        self._places: deque[NDArray[np.float64]] = deque(maxlen=_MOVES + 1)
         self.faults: dict[str, Fault] = {}
         """Faults by kind, each found once."""
 
@@ -148,9 +150,12 @@ class SetUpCheck(Sink):
     def _note_beams(self, result: ScanResult) -> None:
         self._beams = max(self._beams, result.beams or 0)
         self._places.append(result.T_world_imu[:3, 3])
-        if not 0 < self._beams <= _FEW_BEAMS or len(self._places) <= _SCANS:
+        if not 0 < self._beams <= _FEW_BEAMS or len(self._places) <= _MOVES:
             return
         moved = float(np.median(np.linalg.norm(np.diff(self._places, axis=0), axis=1)))
+        if result.shown_motion is not None:
+            # the estimate itself may stay behind
+            moved = max(moved, result.shown_motion.way / result.shown_motion.scans)
         if moved > _FAR_PER_SCAN_M:
             self._found(
                 "beams",

@@ -20,6 +20,7 @@ from lio_jax.lidar.plan_view import (
     leads,
     plan_view,
     refined,
+    shows_motion,
     turn,
 )
 
@@ -135,22 +136,29 @@ def _turned(points: NDArray[np.float32], rotation: Rotation) -> NDArray[np.float
     return points @ rotation.as_matrix().T.astype(np.float32)
 
 
-_AFTER = (1, 3, 9)
-"""Numbers of scans after a reference at which the motion since then is compared."""
+_AFTER, _AFTER_LATER = (1, 3, 9), (5,)
+"""Numbers of scans after a reference at which the motion since then is compared: after the first reference,
+one behind an outage and one in a turn, and after the others."""
 _TURNING = 0.02
 """A turn between two scans above which the motion is compared too, rad: a wrong gyroscope shows in turns."""
+_DISTORTED = 0.05
+"""Scans whose turns since the scans before them differ by more than this are not compared: their sweeps are
+distorted differently, rad."""
 _TURNS_COMPARED, _BETWEEN_TURNS = 5, 20
-"""Number of references that are begun for a turn, and the least number of scans between references."""
+"""Number of references that are begun for a turn, and the least number of scans between them."""
 _TURN_ERRORS = np.delete(np.arange(-15, 16), 15) * 0.02
 """Errors of the turn about the vertical that are searched where the estimated turn explains nothing, rad."""
 _LEAST_TURN_ERROR = 0.06
 """Smaller errors of the turn are not told from none, rad."""
 _ARM = 15.0
 """Distance at which an error of the turn counts as an error of the motion, m."""
-_EVERY = 100
-"""Number of scans from one reference to the next."""
+_EVERY, _EVERY_AT_FIRST, _FIRST = 25, 10, 100
+"""Number of scans from one reference to the next: in general, and among the first scans, when the vehicle
+moves off on a map of one place."""
 _REACH = 5.0
 """Largest error that is searched, m."""
+_UNSUSPICIOUS = 0.2
+"""Smaller errors by cells are not refined, m."""
 _STEP = 0.5
 """Distance between two errors that are tried, m."""
 _POINTS = 40_000
@@ -162,6 +170,9 @@ class _Reference:
     index: int
     view: PlanView
     T_world_lidar: NDArray[np.float64]
+    after: tuple[int, ...]
+    turned: NDArray[np.float64]
+    """(3,) turn since the scan before, rad."""
 
 
 class ShownMotion(NamedTuple):
@@ -184,12 +195,15 @@ class MotionCheck:
         self._reference: _Reference | None = None
         self._next = 0
         self._turns = 0
+        self._next_turn = 0
         self._before: NDArray[np.float64] | None = None
 
     def __call__(
         self, index: int, scan: Scan, T_world_lidar: NDArray[np.float64], lost: bool
-    ) -> ShownMotion | None:
-        """Return what the plan views show of the motion since the reference; None: nothing was compared.
+    ) -> tuple[ShownMotion | None, bool | None]:
+        """Return what plan views show of the motion since the reference, and whether this one shows motion.
+
+        Either is None where it was not looked at.
 
         Args:
             index: number of the scan.
@@ -197,29 +211,36 @@ class MotionCheck:
             T_world_lidar: (4, 4) estimated pose.
             lost: the scan was not matched.
         """
+        turned = self._turn_since_last(T_world_lidar)
         if lost:
             # the next matched scan is compared with the one after it
             self._reference, self._next = None, index + 1
-            return None
+            return None, None
         reference, shown = self._reference, None
         since = index - reference.index if reference else 0
-        turning = self._is_turning(T_world_lidar) and since >= _BETWEEN_TURNS
+        turning = abs(turned[2]) > _TURNING and index >= self._next_turn and self._turns < _TURNS_COMPARED
         begins = index >= self._next or turning
-        if not begins and since not in _AFTER:
-            return None
+        alike = reference is not None and np.linalg.norm(turned - reference.turned) < _DISTORTED
+        compares = reference is not None and alike and since in reference.after
+        if not begins and not compares:
+            return None, None
         view = _view(scan, T_world_lidar)
-        if reference is not None and since in _AFTER:
+        if reference is not None and compares:
             shown = _shown(reference, view, T_world_lidar, since)
-        if begins:
-            self._turns += turning
-            self._reference, self._next = _Reference(index, view, T_world_lidar), index + _EVERY
-        return shown
+        if not begins:
+            return shown, None
+        if turning:
+            self._turns, self._next_turn = self._turns + 1, index + _BETWEEN_TURNS
+        after = _AFTER if turning or reference is None else _AFTER_LATER
+        self._reference = _Reference(index, view, T_world_lidar, after, turned)
+        self._next = index + (_EVERY_AT_FIRST if index < _FIRST else _EVERY)
+        return shown, shows_motion(view)
 
-    def _is_turning(self, T_world_lidar: NDArray[np.float64]) -> bool:
-        before, self._before = self._before, T_world_lidar
-        if before is None or self._turns >= _TURNS_COMPARED:
-            return False
-        return abs(_turn_about_vertical(before, T_world_lidar)) > _TURNING
+    def _turn_since_last(self, T_world_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the turn since the last scan, (3,) rad in the world's axes."""
+        before = T_world_lidar if self._before is None else self._before
+        self._before = T_world_lidar
+        return _turn_between(before, T_world_lidar)
 
 
 def _view(scan: Scan, T_world_lidar: NDArray[np.float64]) -> PlanView:
@@ -235,7 +256,7 @@ def _shown(
     moved = (T_world_lidar - reference.T_world_lidar)[:2, 3].astype(np.float32)
     if np.linalg.norm(moved) > _FAR:
         return None
-    estimated = _turn_about_vertical(reference.T_world_lidar, T_world_lidar)
+    estimated = float(_turn_between(reference.T_world_lidar, T_world_lidar)[2])
     step = FINE if len(view.centers) < _COARSELY else _STEP
 
     def compared(angle: float, every: int = 1) -> Displacement:
@@ -250,16 +271,19 @@ def _shown(
         is_turned = abs(angle) >= _LEAST_TURN_ERROR
         if not found.is_certain or (is_turned and not leads(found.votes, straight)):
             return None
-    shift = refined(reference.view, view.points @ turn(angle) + moved, found.shift)
+    shift = found.shift
+    if np.linalg.norm(shift) > _UNSUSPICIOUS:
+        shift = refined(reference.view, view.points @ turn(angle) + moved, shift)
     error, way = float(np.linalg.norm(shift)), float(np.linalg.norm(moved + shift))
     if abs(angle) < _LEAST_TURN_ERROR:
         return ShownMotion(error, way, estimated, scans)
     return ShownMotion(error + _ARM * abs(angle), way, estimated + angle, scans)
 
 
-def _turn_about_vertical(before: NDArray[np.float64], after: NDArray[np.float64]) -> float:
-    """Return the turn between two poses (4, 4) about the world's vertical, rad."""
-    return float(Rotation.from_matrix(after[:3, :3] @ before[:3, :3].T).as_rotvec()[2])
+def _turn_between(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the turn between two poses (4, 4), (3,) rad in the world's axes."""
+    turned: NDArray[np.float64] = Rotation.from_matrix(after[:3, :3] @ before[:3, :3].T).as_rotvec()
+    return turned
 
 
 _FAR = 15.0

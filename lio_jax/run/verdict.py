@@ -25,6 +25,10 @@ _LARGEST_NIS = 25.0
 """Largest mean of the normalised innovation per degree of freedom over the window; 1 is expected."""
 _LOST_S = 1.0
 """Time without a match at the end of a run from which it ends lost, s."""
+_STRONGEST, _ROUGHEST = 30.0, 10.0
+"""Largest acceleration from scan to scan, and largest median of it over ten scans, m/s^2: no body that drives
+or is carried reaches them, a match that jumps does."""
+_ROUGH_SCANS = 10
 _UNOBSERVED_M = 20.0
 """Way with an unobserved direction of motion that is tolerated where no inertial samples bridge it, m."""
 
@@ -37,6 +41,11 @@ class _Evidence:
     unmatched_since_s: float | None = None
     unobserved_m: float = 0.0
     contradictions: int = 0
+    hidden_m: float = 0.0
+    hides: bool = False
+    since_look: float = 0.0
+    velocity: NDArray[np.float64] | None = None
+    accelerations: deque[float] = field(default_factory=lambda: deque(maxlen=_ROUGH_SCANS))
     unconverged: deque[bool] = field(default_factory=lambda: deque(maxlen=_WINDOW))
     nis: deque[float] = field(default_factory=lambda: deque(maxlen=_WINDOW))
 
@@ -66,6 +75,8 @@ class Verdict(Sink):
         self._note_motion(result)
         self._note_window(result)
         self._note_unobserved(result, step)
+        self._note_hidden(result, step)
+        self._note_jumps(result)
         self._before = result
 
     def finish(self, run: RunResult) -> None:
@@ -103,7 +114,7 @@ class Verdict(Sink):
         unmatched = self._seen.unmatched_since_s
         if lost and unmatched is None and before is not None:
             unmatched = (before.stamp_ns - (self._first_ns or 0)) * 1e-9
-        if output.new_piece is not None and bool(output.new_piece):
+        if _is_true(output.new_piece):
             assert unmatched is not None
             gap = self._now_s - unmatched
             sigma = _sigma(output.covariance)
@@ -153,7 +164,7 @@ class Verdict(Sink):
         sigma = _sigma(output.covariance)
         if sigma is not None and sigma > max(TOLERATED_M, TOLERATED_SHARE * seen.way):
             self._doubt("covariance", f"the position's standard deviation reached {sigma:.1f} m")
-        if output.restarted is not None and bool(output.restarted):
+        if _is_true(output.restarted):
             self._doubt("restart", f"at {self._now_s:.1f} s velocity or biases ran away and began anew")
 
     def _note_unobserved(self, result: ScanResult, step: float) -> None:
@@ -167,6 +178,55 @@ class Verdict(Sink):
                 f"up to {self._now_s:.1f} s the scene left a direction unobserved over "
                 f"{self._seen.unobserved_m:.0f} m",
             )
+
+    def _note_hidden(self, result: ScanResult, step: float) -> None:
+        """Add up the way along which nothing but the recipe's own match shows the motion."""
+        seen = self._seen
+        if result.output.covariance is not None:
+            return
+        seen.since_look += step
+        if result.shows_motion:
+            seen.hides, seen.hidden_m = False, 0.0
+        elif result.shows_motion is not None and not seen.hides:
+            # it began somewhere since the last look
+            seen.hides, seen.hidden_m = True, seen.since_look / 2
+        elif seen.hides:
+            seen.hidden_m += step
+        if result.shows_motion is not None:
+            seen.since_look = 0.0
+        if seen.hidden_m > max(_UNOBSERVED_M, TOLERATED_SHARE * seen.way):
+            self._doubt(
+                "unobserved",
+                f"up to {self._now_s:.1f} s nothing upright shows the motion over {seen.hidden_m:.0f} m, as "
+                "in a tunnel or on a plain, and no inertial samples bridge it",
+            )
+
+    def _note_jumps(self, result: ScanResult) -> None:
+        """Look for accelerations that no vehicle has."""
+        before, seen, output = self._before, self._seen, result.output
+        interval = (result.stamp_ns - before.stamp_ns) * 1e-9 if before is not None else 0.0
+        restarts = _is_true(output.restarted) or _is_true(output.new_piece) or bool(output.lost)
+        if before is None or interval <= 0 or restarts:
+            seen.velocity = None
+            seen.accelerations.clear()
+            return
+        last, velocity = seen.velocity, (result.T_world_imu - before.T_world_imu)[:3, 3] / interval
+        seen.velocity = velocity
+        if last is None:
+            return
+        seen.accelerations.append(float(np.linalg.norm(velocity - last)) / interval)
+        full = len(seen.accelerations) == _ROUGH_SCANS
+        rough = float(np.median(seen.accelerations)) if full else 0.0
+        if seen.accelerations[-1] > _STRONGEST or rough > _ROUGHEST:
+            self._doubt(
+                "jumps",
+                f"at {self._now_s:.1f} s the estimated motion jumps by accelerations of "
+                f"{max(seen.accelerations):.0f} m/s^2: the scan match is wrong",
+            )
+
+
+def _is_true(flag: Any) -> bool:
+    return flag is not None and bool(flag)
 
 
 def in_words(verdict: dict[str, Any]) -> str:

@@ -83,6 +83,7 @@ class SimulatedSequence:
         gps: GpsModel | None = None,
         standstill_s: float | None = None,
         moving_start: bool = False,
+        swing_rate: float = 0.8,
         trajectory: Trajectory | None = None,
         T_imu_lidar: NDArray[np.floating[Any]] | None = None,
     ) -> None:
@@ -99,6 +100,7 @@ class SimulatedSequence:
             gps: the GPS receiver; None: the recording has none.
             standstill_s: time at rest at the route's start, s; None: 1.5, or 0 with a moving start.
             moving_start: whether the recording starts at full speed on the world's route.
+            swing_rate: how fast a handheld body looks around on the world's route, rad/s, 0 to 10.
             trajectory: T_world_imu to follow, from its first pose on, instead of the world's route.
             T_imu_lidar: (4, 4) pose of the lidar in the IMU frame; None: a small lever arm and rotation.
 
@@ -119,7 +121,12 @@ class SimulatedSequence:
         if trajectory is None:
             rest = _STANDSTILL * (not moving_start) if standstill_s is None else standstill_s
             self.motion: Motion = motion_along(
-                scene.route, duration_s=duration_s, standstill_s=rest, moving_start=moving_start, seed=seed
+                scene.route,
+                duration_s=duration_s,
+                standstill_s=rest,
+                moving_start=moving_start,
+                seed=seed,
+                swing_rate=swing_rate,
             )
         else:
             if moving_start or standstill_s:
