@@ -20,8 +20,9 @@ class MotionOptions:
     """Time at rest at the start; None means 1.5 s, or none with --moving-start."""
     moving_start: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Start at full speed."""
-    swing_rate: Annotated[float, arg(metavar="RAD/S")] = 0.8
-    """How fast a hand looks around (office, stairs); 4 is as fast as a wrist can."""
+    swing_rate: Annotated[float | None, arg(metavar="RAD/S")] = None
+    """How fast a hand looks around in worlds through which it carries the sensor; None means 0.8, and 4 is as
+    fast as a wrist can."""
     trajectory: Annotated[Path | None, arg(metavar="FILE")] = None
     """Poses T_world_imu (TUM, run folder or recording) to move through, instead of the world's own route."""
 

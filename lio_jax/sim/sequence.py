@@ -35,6 +35,8 @@ EPOCH_NS = 1_700_000_000_000_000_000
 
 _TRUTH_STEP_NS = 10_000_000
 _POSES_AT_ONCE = 4096
+_SWING_RATE = 0.8
+"""Default of how fast a hand looks around, rad/s."""
 _STANDSTILL = 1.5
 """Default time at rest before the body moves off, s."""
 _DURATION = 10.0
@@ -83,7 +85,7 @@ class SimulatedSequence:
         gps: GpsModel | None = None,
         standstill_s: float | None = None,
         moving_start: bool = False,
-        swing_rate: float = 0.8,
+        swing_rate: float | None = None,
         trajectory: Trajectory | None = None,
         T_imu_lidar: NDArray[np.floating[Any]] | None = None,
     ) -> None:
@@ -100,7 +102,7 @@ class SimulatedSequence:
             gps: the GPS receiver; None: the recording has none.
             standstill_s: time at rest at the route's start, s; None: 1.5, or 0 with a moving start.
             moving_start: whether the recording starts at full speed on the world's route.
-            swing_rate: how fast a handheld body looks around on the world's route, rad/s, 0 to 10.
+            swing_rate: how fast a handheld body looks around on the world's route, rad/s, 0 to 10; None: 0.8.
             trajectory: T_world_imu to follow, from its first pose on, instead of the world's route.
             T_imu_lidar: (4, 4) pose of the lidar in the IMU frame; None: a small lever arm and rotation.
 
@@ -120,18 +122,23 @@ class SimulatedSequence:
         self.world = scene.world
         if trajectory is None:
             rest = _STANDSTILL * (not moving_start) if standstill_s is None else standstill_s
+            if swing_rate is not None and scene.route.dynamics != "handheld":
+                raise UsageError(
+                    f"in the world '{name}' nobody carries the sensor; leave the swing rate out."
+                )
             self.motion: Motion = motion_along(
                 scene.route,
                 duration_s=duration_s,
                 standstill_s=rest,
                 moving_start=moving_start,
                 seed=seed,
-                swing_rate=swing_rate,
+                swing_rate=_SWING_RATE if swing_rate is None else swing_rate,
             )
         else:
-            if moving_start or standstill_s:
+            if moving_start or standstill_s or swing_rate is not None:
                 raise UsageError(
-                    "a trajectory itself says when it moves; leave standstill and moving start out."
+                    "a trajectory itself says how it moves; "
+                    "leave standstill, moving start and swing rate out."
                 )
             if duration_s > _span(trajectory) + 1e-9:
                 raise UsageError(

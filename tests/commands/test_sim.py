@@ -190,8 +190,9 @@ def test_defaults(arguments):
 
 
 def test_motion_options(arguments, native):
-    asked = arguments(motion=MotionOptions(standstill=3.0, moving_start=True))
+    asked = arguments(motion=MotionOptions(standstill=3.0, moving_start=True, swing_rate=4.0))
     assert asked["standstill_s"] == 3.0
+    assert asked["swing_rate"] == 4.0
     assert asked["moving_start"] is True
     asked = arguments(motion=MotionOptions(trajectory=native / "truth.tum"), duration=None)
     assert asked["duration_s"] is None
@@ -344,7 +345,7 @@ def test_trajectories_that_cannot_be_followed(cli, tmp_path, native):
     assert missing.status == 1
     assert "nothing.tum: there is no such file or folder" in missing.err
     assert "04.txt: has no time stamps" in _refused(ask(folder / "04.txt"), out)
-    assert "a trajectory itself says when it moves" in _refused(ask(native, "--moving-start"), out)
+    assert "a trajectory itself says how it moves" in _refused(ask(native, "--moving-start"), out)
     assert "ends after 0.30 s, before the wanted 5.0 s" in _refused(ask(native, "--duration", 5), out)
 
 

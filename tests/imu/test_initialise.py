@@ -274,3 +274,13 @@ def test_single_precision_does_as_well():
     assert bool(found.is_still)
     assert float(found.start.nav.gyro_bias[0]) == pytest.approx(0.01, abs=0.01)
     assert np.all(np.diagonal(found.start.covariance) >= 0)
+
+
+def test_a_velocity_that_is_given_has_the_given_uncertainty(initialise):
+    known = eqx.tree_at(
+        lambda initial: (initial.velocity, initial.velocity_sigma),
+        PARAMS.initial,
+        (jnp.array([10.0, 0.0, 0.0]), jnp.asarray(0.3)),
+    )
+    found = initialise(moving("turns at 10 m/s"), known)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(found.start.covariance))[VELOCITY], 0.3, rtol=1e-9)

@@ -64,6 +64,41 @@ def test_how_wrong_a_motion_may_be_depends_on_the_way(error, way, state):
     assert verdict_of(settings, [*results[:-2], seen, seen])["state"] == state
 
 
+def moved(result, number, step):
+    """Return a result as that of another scan, moved along x."""
+    pose = result.T_world_imu.copy()
+    pose[0, 3] += step
+    stamp_ns = result.stamp_ns + number * 100_000_000
+    return replace(result, T_world_imu=pose, stamp_ns=stamp_ns, shown_motion=None, shows_motion=None)
+
+
+@pytest.mark.parametrize(("jump", "state"), [(0.05, "sound"), (0.7, "doubtful")])
+def test_a_motion_that_jumps_is_noticed(jump, state):
+    settings, results = tracked(road("street", 25.0, 0.0, 8), "default")
+    last = results[-1]
+    jumping = [moved(last, number, 2.5 * number + jump * (number > 3)) for number in range(1, 12)]
+    found = verdict_of(settings, [*results, *jumping])
+    assert found["state"] == state
+    assert ("jumps" in " ".join(found["reasons"])) == (state != "sound")
+
+
+@pytest.mark.parametrize(
+    ("recipe", "shows", "state"),
+    [
+        ("loam", False, "doubtful"),
+        ("loam", True, "sound"),
+        ("default", False, "sound"),
+    ],
+)
+def test_a_way_along_which_nothing_shows_the_motion_is_doubtful_without_inertial_samples(
+    recipe, shows, state
+):
+    settings, results = tracked(road("street", 25.0, 0.0, 8), recipe)
+    onwards = [moved(results[-1], number, 2.5 * number) for number in range(1, 12)]
+    onwards[0] = replace(onwards[0], shows_motion=shows)
+    assert verdict_of(settings, [*results, *onwards])["state"] == state
+
+
 @pytest.mark.parametrize("recipe", ["default", "fast_lio2", "lio_sam", "loam"])
 def test_a_right_start_is_sound(recipe):
     found = verdict_of(*tracked(road("street", 25.0, 0.0, 8), recipe))

@@ -275,7 +275,16 @@ def test_a_trajectory_that_ends_too_soon_is_refused():
         SimulatedSequence("room", duration_s=3.0, trajectory=_standing(2.0))
 
 
-@pytest.mark.parametrize("words", [{"moving_start": True}, {"standstill_s": 2.0}])
+@pytest.mark.parametrize("words", [{"moving_start": True}, {"standstill_s": 2.0}, {"swing_rate": 4.0}])
 def test_a_trajectory_leaves_no_choice_of_the_start(words):
-    with pytest.raises(UsageError, match="a trajectory itself says when it moves"):
+    with pytest.raises(UsageError, match="a trajectory itself says how it moves"):
         SimulatedSequence("room", trajectory=_standing(2.0), **words)
+
+
+def test_a_hand_looks_around_as_fast_as_is_asked_for():
+    def turning(**words):
+        return np.abs(SimulatedSequence("office", duration_s=6.0, imu=ImuModel(), **words).imu().gyro).max()
+
+    assert turning(swing_rate=4.0) > 2 * turning()
+    with pytest.raises(UsageError, match="nobody carries the sensor"):
+        SimulatedSequence("street", swing_rate=4.0)
