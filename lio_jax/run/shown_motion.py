@@ -172,7 +172,12 @@ class _Reference:
     T_world_lidar: NDArray[np.float64]
     after: tuple[int, ...]
     turned: NDArray[np.float64]
-    """(3,) turn since the scan before, rad."""
+    """(3,) turn since the scan before, rad; not finite where there is none."""
+
+    @property
+    def searches_turns(self) -> bool:
+        """Return whether a wrong turn is searched too: that takes 30 comparisons."""
+        return self.after == _AFTER
 
 
 class ShownMotion(NamedTuple):
@@ -220,13 +225,13 @@ class MotionCheck:
         since = index - reference.index if reference else 0
         turning = abs(turned[2]) > _TURNING and index >= self._next_turn and self._turns < _TURNS_COMPARED
         begins = index >= self._next or turning
-        alike = reference is not None and np.linalg.norm(turned - reference.turned) < _DISTORTED
-        compares = reference is not None and alike and since in reference.after
-        if not begins and not compares:
+        compared = reference if reference is not None and since in reference.after else None
+        if not begins and compared is None:
             return None, None
         view = _view(scan, T_world_lidar)
-        if reference is not None and compares:
-            shown = _shown(reference, view, T_world_lidar, since)
+        # of the first scan's own turn nothing is known
+        if compared is not None and not np.linalg.norm(turned - compared.turned) > _DISTORTED:
+            shown = _shown(compared, view, T_world_lidar, since)
         if not begins:
             return shown, None
         if turning:
@@ -238,9 +243,8 @@ class MotionCheck:
 
     def _turn_since_last(self, T_world_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the turn since the last scan, (3,) rad in the world's axes."""
-        before = T_world_lidar if self._before is None else self._before
-        self._before = T_world_lidar
-        return _turn_between(before, T_world_lidar)
+        before, self._before = self._before, T_world_lidar
+        return np.full(3, np.nan) if before is None else _turn_between(before, T_world_lidar)
 
 
 def _view(scan: Scan, T_world_lidar: NDArray[np.float64]) -> PlanView:
@@ -264,6 +268,8 @@ def _shown(
         return displacement(reference.view, centers + moved, _REACH, step)
 
     found, angle = compared(0.0), 0.0
+    if not found.is_certain and not reference.searches_turns:
+        return None
     if not found.is_certain:
         every = max(1, len(view.centers) // _COARSELY)
         angle = float(max(_TURN_ERRORS, key=lambda one: compared(one, every).votes))
