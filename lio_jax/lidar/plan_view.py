@@ -176,7 +176,7 @@ _LONGEST = 20.0
 
 def _width(cell: float) -> int:
     """Return the number of cells along an edge of the grid: no displaced point falls outside."""
-    return int(2 * (_FARTHEST + _LONGEST) / cell) + 2
+    return int(2 * (_FARTHEST + _LONGEST + _FINE_REACH) / cell) + 2
 
 
 def _cell_of(positions: NDArray[np.float32], cell: float) -> NDArray[np.int32]:

@@ -78,3 +78,12 @@ def test_a_view_is_turned_about_the_vertical():
 
 def test_an_empty_scan_has_an_empty_view():
     assert not plan_view(np.zeros((0, 3), np.float32)).occupied.any()
+
+
+def test_far_poles_behind_a_long_way_are_met():
+    # the grid has room for the longest displacement of the farthest point, and for its correction
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    places = 59.9 * np.column_stack([np.cos(angle), np.sin(angle)])
+    first = plan_view(seen(places, (-20, 0)))
+    second = plan_view(seen(places, (0, 0)))
+    assert np.isfinite(refined(first, second.points, np.array([20.0, 0.0]))).all()
