@@ -26,7 +26,7 @@ from lio_jax.sim.office import office
 from lio_jax.sim.open_worlds import field, room, street
 from lio_jax.sim.sensors import Layout, RosetteLidar, find_sensor
 from lio_jax.sim.stairs import stairs
-from lio_jax.sim.trajectory import Motion, motion_along, motion_through, pose_at
+from lio_jax.sim.trajectory import SWING_RATE, Motion, motion_along, motion_through, pose_at
 from lio_jax.sim.tunnel import tunnel
 from lio_jax.sim.worlds import Counts, Part, Scene, World, counts_along, nearest_part
 
@@ -35,8 +35,6 @@ EPOCH_NS = 1_700_000_000_000_000_000
 
 _TRUTH_STEP_NS = 10_000_000
 _POSES_AT_ONCE = 4096
-_SWING_RATE = 0.8
-"""Default of how fast a hand looks around, rad/s."""
 _STANDSTILL = 1.5
 """Default time at rest before the body moves off, s."""
 _DURATION = 10.0
@@ -132,7 +130,7 @@ class SimulatedSequence:
                 standstill_s=rest,
                 moving_start=moving_start,
                 seed=seed,
-                swing_rate=_SWING_RATE if swing_rate is None else swing_rate,
+                swing_rate=SWING_RATE if swing_rate is None else swing_rate,
             )
         else:
             if moving_start or standstill_s or swing_rate is not None:

@@ -17,6 +17,8 @@ from lio_jax.sim.dynamics import HANDLING, Sway, bank_angles, sway
 from lio_jax.sim.route_smoothing import timed_path
 from lio_jax.sim.worlds import Route
 
+SWING_RATE = 0.8
+"""Default of how fast a hand looks around, rad/s."""
 _DEGREE = 5
 _LARGEST_TURN = np.deg2rad(90)
 
@@ -212,7 +214,7 @@ def motion_along(
     standstill_s: float = 0.0,
     moving_start: bool = False,
     seed: int = 0,
-    swing_rate: float = 0.8,
+    swing_rate: float = SWING_RATE,
 ) -> RouteMotion:
     """Return the motion of a body along a route.
 
