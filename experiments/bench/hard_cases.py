@@ -9,33 +9,26 @@ python experiments/bench/hard_cases.py set-ups [--recipes default] [--seeds 7]
 A scene is passed if the error stays below one percent of the way, or a warning comes before the error exceeds
 one metre. A wrong set-up is found if a fault is named within 20 s. A start is right if every move after the
 third scan is within 5 % of the true one, and the last position within 5 % of the way. A miss is a start that
-is not right and whose verdict is sound.
+is not right and whose verdict is sound. --recipes takes the peers too: kiss-icp and rko-lio.
 """
 
 import argparse
 import json
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from faulty import SET_UPS, Faulty
+from hard_runs import PEERS, judged, moves, relative
 from roads import driven_along, road_scene
-from scipy.spatial.transform import Rotation
 
 from lio_jax.commands.runtime import prepare_jax
 from lio_jax.data.detect import open_sequence
-from lio_jax.data.sequence import ImuData, LidarScan, Sequence
-from lio_jax.data.trajectory import Trajectory
-from lio_jax.run.run import imu_feed, settings_for
-from lio_jax.run.set_up_check import Fault, SetUpCheck
-from lio_jax.run.sinks import RunResult
-from lio_jax.run.track import ScanResult, track
-from lio_jax.run.verdict import Verdict
-from lio_jax.settings.settings import recipe_settings, with_overrides
+from lio_jax.data.sequence import LidarScan
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
 
@@ -46,56 +39,6 @@ SPEEDS = (5.0, 15.0, 25.0, 35.0)
 TURNS = (0.0, 0.5)
 BEFORE, AFTER = 100, 100
 """Number of scans before an outage and after it."""
-
-
-@dataclass(frozen=True)
-class Judged:
-    """A run with its verdict."""
-
-    results: list[ScanResult]
-    verdict: dict[str, Any]
-    faults: list[Fault]
-
-
-def judged(sequence: Sequence, scans: Iterable[LidarScan], recipe: str, lidar_only: bool = False) -> Judged:
-    """Return a recipe's results over some scans, and what the run says of itself."""
-    settings = recipe_settings(recipe)
-    if lidar_only and recipe != "loam":
-        settings = with_overrides(settings, ["config.imu.use=false"])
-    settings, _ = settings_for(sequence, settings)
-    imu, _ = imu_feed(sequence, settings)
-    results, run = [], RunResult()
-    check, judge = SetUpCheck(settings, imu.samples if imu else None), Verdict(settings)
-    for result in track(settings, scans, imu):
-        check.take(result)
-        judge.take(result)
-        results.append(result)
-    check.finish(run)
-    judge.finish(run)
-    return Judged(results, run.metrics["verdict"], list(check.faults.values()))
-
-
-def ran(
-    sequence: Sequence, scans: Iterable[LidarScan], recipe: str, lidar_only: bool = False
-) -> tuple[list[ScanResult], str]:
-    """Return a recipe's results over some scans, and the state of the verdict."""
-    run = judged(sequence, scans, recipe, lidar_only)
-    return run.results, run.verdict["state"]
-
-
-def relative(results: list[ScanResult], sequence: Sequence) -> tuple[np.ndarray, np.ndarray]:
-    """Return estimated and true poses (n, 4, 4), each relative to the first."""
-    stamps = np.array([one.stamp_ns for one in results])
-    truth = sequence.truth()
-    assert truth is not None
-    true = truth.at(stamps)
-    poses = np.array([one.T_world_imu for one in results])[np.isin(stamps, true.stamp_ns)]
-    return np.linalg.inv(poses[0]) @ poses, np.linalg.inv(true.poses[0]) @ true.poses
-
-
-def moves(poses: np.ndarray) -> np.ndarray:
-    """Return the distances between consecutive poses, m."""
-    return np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
 
 
 def starts(options: argparse.Namespace) -> list[Row]:
@@ -112,12 +55,12 @@ def starts(options: argparse.Namespace) -> list[Row]:
         )
         scans = list(sequence.scans())
         for recipe in options.recipes:
-            results, state = ran(sequence, scans, recipe, options.lidar_only)
-            estimated, true = relative(results, sequence)
+            run = judged(sequence, scans, recipe, options.lidar_only)
+            estimated, true = relative(run.results, sequence)
             ratio = moves(estimated)[2:] / moves(true)[2:]
             error = np.linalg.norm((estimated - true)[-1, :3, 3])
             right = bool(np.abs(ratio - 1).max() < 0.05 and error < 0.05 * moves(true).sum())
-            missed = not right and state == "sound"
+            missed = not right and run.verdict["state"] == "sound"
             rows.append(
                 {
                     "recipe": recipe,
@@ -149,12 +92,12 @@ def drive(options: argparse.Namespace) -> list[Row]:
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for recipe, start in product(options.recipes, options.starts):
         scans = sequence.scans(start, options.scans)
-        results, state = ran(sequence, scans, recipe, options.lidar_only)
-        estimated, true = relative(results, sequence)
+        run = judged(sequence, scans, recipe, options.lidar_only)
+        estimated, true = relative(run.results, sequence)
         speed = moves(estimated)[:3].sum() / moves(true)[:3].sum() - 1
         way = moves(estimated).sum() / moves(true).sum() - 1
         height = float((estimated - true)[-1, 2, 3])
-        failed = sum(bool(one.failure) for one in results)
+        failed, state = sum(one.failed for one in run.results), run.verdict["state"]
         rows.append(
             {
                 "recipe": recipe,
@@ -168,7 +111,7 @@ def drive(options: argparse.Namespace) -> list[Row]:
         )
         print(
             f"| {recipe} | {start} | {100 * speed:+.1f} % | {100 * way:+.1f} % | {height:+.2f} m | "
-            f"{failed} of {len(results)} | {state} |",
+            f"{failed} of {len(run.results)} | {state} |",
             flush=True,
         )
     return rows
@@ -191,13 +134,12 @@ def outages(options: argparse.Namespace) -> list[Row]:
     print("| recipe | outage | lost afterwards | error, m | its sigma, m | drift afterwards, m | verdict |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for (name, given), recipe in product(cases.items(), options.recipes):
-        results, state = ran(whole, given, recipe, options.lidar_only)
+        run = judged(whole, given, recipe, options.lidar_only)
+        results, state = run.results, run.verdict["state"]
         back = len(results) - AFTER
-        lost = sum(bool(one.output.lost) for one in results[back:])
+        lost = sum(one.lost for one in results[back:])
         estimated, true = relative(results, whole)
         error = float(np.linalg.norm((estimated - true)[-1, :3, 3]))
-        covariance = results[-1].output.covariance
-        sigma = None if covariance is None else float(np.sqrt(np.trace(np.asarray(covariance)[3:6, 3:6])))
         estimated, true = relative(results[back + 5 :], whole)
         drift = float(np.linalg.norm((estimated - true)[-1, :3, 3]))
         rows.append(
@@ -206,12 +148,12 @@ def outages(options: argparse.Namespace) -> list[Row]:
                 "outage": name,
                 "lost": lost,
                 "error_m": error,
-                "sigma_m": sigma,
+                "sigma_m": run.sigma,
                 "drift_m": drift,
             }
             | {"verdict": state}
         )
-        known = "-" if sigma is None else f"{sigma:.2f}"
+        known = "-" if run.sigma is None else f"{run.sigma:.2f}"
         print(f"| {recipe} | {name} | {lost} | {error:.2f} | {known} | {drift:.3f} | {state} |", flush=True)
     return rows
 
@@ -258,79 +200,6 @@ def scenes(options: argparse.Namespace) -> list[Row]:
     return rows
 
 
-class Faulty:
-    """A recording with a wrong set-up."""
-
-    def __init__(
-        self,
-        sequence: Sequence,
-        turn: Rotation | None = None,
-        move: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        late_s: float = 0.0,
-        axes: NDArray | None = None,
-        gyro: tuple[float, float, float] = (1.0, 1.0, 1.0),
-        sweep: float = 1.0,
-    ) -> None:
-        """Change a recording.
-
-        Args:
-            sequence: the right one.
-            turn: of the extrinsic.
-            move: of the extrinsic, m.
-            late_s: added to the inertial stamps.
-            axes: (3, 3) turn of the inertial samples.
-            gyro: factors of the gyroscope's axes.
-            sweep: factor of the points' times.
-        """
-        T_imu_lidar = np.array(sequence.info.T_imu_lidar)
-        if turn is not None:
-            T_imu_lidar[:3, :3] = T_imu_lidar[:3, :3] @ turn.as_matrix()
-        T_imu_lidar[:3, 3] += move
-        self.info = replace(sequence.info, T_imu_lidar=T_imu_lidar)
-        self.warnings_so_far = ()
-        self._sequence, self._late_s, self._sweep = sequence, late_s, sweep
-        self._axes, self._gyro = np.eye(3) if axes is None else axes, np.array(gyro)
-
-    def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
-        """Yield the scans, their sweeps stretched."""
-        for scan in self._sequence.scans(start, count):
-            yield self.changed(scan)
-
-    def changed(self, scan: LidarScan) -> LidarScan:
-        """Return a scan with its sweep stretched."""
-        return replace(scan, time=scan.time * self._sweep, duration=scan.duration * self._sweep)
-
-    def imu(self) -> ImuData:
-        """Return the samples, changed."""
-        imu = self._sequence.imu()
-        return replace(
-            imu,
-            stamp_ns=imu.stamp_ns + round(self._late_s * 1e9),
-            gyro=imu.gyro * self._gyro @ self._axes.T,
-            accel=imu.accel @ self._axes.T,
-        )
-
-    def gps(self) -> None:
-        """Return None."""
-
-    def truth(self) -> Trajectory:
-        """Return the truth of the right recording."""
-        return self._sequence.truth()
-
-
-SET_UPS: dict[str, dict[str, Any]] = {
-    "rotation 10 deg about x": {"turn": Rotation.from_euler("x", 10, degrees=True)},
-    "rotation 5 deg about z": {"turn": Rotation.from_euler("z", 5, degrees=True)},
-    "translation 0.5 m": {"move": (0.5, 0.0, 0.0)},
-    "clock 50 ms late": {"late_s": 0.05},
-    "clock 30 ms early": {"late_s": -0.03},
-    "IMU turned by 90 deg": {"axes": Rotation.from_euler("z", 90, degrees=True).as_matrix()},
-    "gyroscope's z has the wrong sign": {"gyro": (1.0, 1.0, -1.0)},
-    "gyroscope at half its rates": {"gyro": (0.5, 0.5, 0.5)},
-    "sweeps of twice the length": {"sweep": 2.0},
-    "8 beams": {},
-}
-"""Arguments of :class:`Faulty`."""
 WORLDS_OF_SET_UPS = ("street", "city", "field")
 
 
@@ -407,6 +276,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.section == "drive" and options.recording is None:
         parser.error("drive: give --recording.")
+    if options.section == "set-ups" and set(options.recipes) & set(PEERS):
+        parser.error("set-ups: peers name no faults; give --recipes without them.")
     prepare_jax()
     rows = SECTIONS[options.section](options)
     if options.json:

@@ -20,8 +20,6 @@ FINE = 0.25
 """Distance between two displacements that are tried, m."""
 _PEAK, _APART = 0.8, 1.2
 """Displacements nearer to the best one belong to it; farther ones are rivals, m."""
-_CLEAR_REACH = 3.0
-"""Displacements up to this one have to show in a view, m."""
 _FEWEST = 8
 """So few votes may come from one vehicle that moves along."""
 _FINE_CELL, _FINE_STEP, _FINE_REACH = 0.1, 0.05, 0.35
@@ -65,11 +63,6 @@ class Displacement(NamedTuple):
         lead = self.own_votes - self.rival_votes
         is_seen = self.votes > _FEWEST and self.share > 0.5
         return is_seen and lead > 0.15 * self.votes and leads(self.own_votes, self.rival_votes)
-
-
-def shows_motion(view: PlanView) -> bool:
-    """Return whether a plan view shows any displacement: in a tunnel or on a plain it does not."""
-    return displacement(view, view.centers, _CLEAR_REACH, CELL).is_certain
 
 
 def leads(votes: int, rival: int) -> bool:

@@ -46,7 +46,7 @@ _LONG, _SHORT = 1.15, 0.75
 """Range of the sweep's duration over the time between scans that passes."""
 
 
-_MOVES = 5
+_MOVES = 3
 """Number of moves from scan to scan whose median counts."""
 _FEW_BEAMS, _FAR_PER_SCAN_M = 10, 0.2
 """A sensor of so few beams that moves farther than this from scan to scan, m, sees little twice."""

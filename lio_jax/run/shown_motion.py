@@ -20,7 +20,6 @@ from lio_jax.lidar.plan_view import (
     leads,
     plan_view,
     refined,
-    shows_motion,
     turn,
 )
 
@@ -136,9 +135,12 @@ def _turned(points: NDArray[np.float32], rotation: Rotation) -> NDArray[np.float
     return points @ rotation.as_matrix().T.astype(np.float32)
 
 
-_AFTER, _AFTER_LATER = (1, 3, 9), (5,)
-"""Numbers of scans after a reference at which the motion since then is compared: after the first reference,
-one behind an outage and one in a turn, and after the others."""
+_AFTER = 1, 3, 9
+"""Numbers of scans after the first reference, one behind an outage and one in a turn, at which the motion
+since then is compared."""
+_AFTER_LATER, _WAY_LATER = 5, 10.0
+"""Number of scans after any other reference at which the motion is compared, less if the way would be longer
+than this, m."""
 _TURNING = 0.02
 """A turn between two scans above which the motion is compared too, rad: a wrong gyroscope shows in turns."""
 _DISTORTED = 0.05
@@ -154,7 +156,7 @@ _ARM = 15.0
 """Distance at which an error of the turn counts as an error of the motion, m."""
 _EVERY, _EVERY_AT_FIRST, _FIRST = 25, 10, 100
 """Number of scans from one reference to the next: in general, and among the first scans, when the vehicle
-moves off on a map of one place."""
+moves off on a map of one place. Where a comparison shows nothing, the next reference begins at once."""
 _REACH = 5.0
 """Largest error that is searched, m."""
 _UNSUSPICIOUS = 0.2
@@ -193,6 +195,15 @@ class ShownMotion(NamedTuple):
     """Number of scans from the first of the two to the second."""
 
 
+class Look(NamedTuple):
+    """What the comparison of two plan views shows."""
+
+    shown: ShownMotion | None = None
+    """The motion; None where nothing was compared, or where it is hidden."""
+    is_hidden: bool | None = None
+    """Whether the views fit each other at several displacements or at none; None: nothing was compared."""
+
+
 class MotionCheck:
     """Compares the estimated motion with the plan views of single scans."""
 
@@ -203,12 +214,8 @@ class MotionCheck:
         self._next_turn = 0
         self._before: NDArray[np.float64] | None = None
 
-    def __call__(
-        self, index: int, scan: Scan, T_world_lidar: NDArray[np.float64], lost: bool
-    ) -> tuple[ShownMotion | None, bool | None]:
-        """Return what plan views show of the motion since the reference, and whether this one shows motion.
-
-        Either is None where it was not looked at.
+    def __call__(self, index: int, scan: Scan, T_world_lidar: NDArray[np.float64], lost: bool) -> Look:
+        """Return what plan views show of the motion since the reference.
 
         Args:
             index: number of the scan.
@@ -216,35 +223,40 @@ class MotionCheck:
             T_world_lidar: (4, 4) estimated pose.
             lost: the scan was not matched.
         """
-        turned = self._turn_since_last(T_world_lidar)
+        turned, step = self._motion_since_last(T_world_lidar)
         if lost:
             # the next matched scan is compared with the one after it
             self._reference, self._next = None, index + 1
-            return None, None
-        reference, shown = self._reference, None
+            return Look()
+        reference, look = self._reference, Look()
         since = index - reference.index if reference else 0
         turning = abs(turned[2]) > _TURNING and index >= self._next_turn and self._turns < _TURNS_COMPARED
         begins = index >= self._next or turning
         compared = reference if reference is not None and since in reference.after else None
         if not begins and compared is None:
-            return None, None
+            return look
         view = _view(scan, T_world_lidar)
         # of the first scan's own turn nothing is known
         if compared is not None and not np.linalg.norm(turned - compared.turned) > _DISTORTED:
-            shown = _shown(compared, view, T_world_lidar, since)
+            look = _compared_with(compared, view, T_world_lidar, since)
+            begins = begins or (bool(look.is_hidden) and not compared.searches_turns)
         if not begins:
-            return shown, None
+            return look
         if turning:
             self._turns, self._next_turn = self._turns + 1, index + _BETWEEN_TURNS
-        after = _AFTER if turning or reference is None else _AFTER_LATER
+        later = int(np.clip(_WAY_LATER / max(step, 1e-3), 1, _AFTER_LATER))
+        after = _AFTER if turning or reference is None else (later,)
         self._reference = _Reference(index, view, T_world_lidar, after, turned)
         self._next = index + (_EVERY_AT_FIRST if index < _FIRST else _EVERY)
-        return shown, shows_motion(view)
+        return look
 
-    def _turn_since_last(self, T_world_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the turn since the last scan, (3,) rad in the world's axes."""
+    def _motion_since_last(self, T_world_lidar: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+        """Return the turn since the last scan, (3,) rad in the world's axes, and the distance, m."""
         before, self._before = self._before, T_world_lidar
-        return np.full(3, np.nan) if before is None else _turn_between(before, T_world_lidar)
+        if before is None:
+            return np.full(3, np.nan), 0.0
+        moved = T_world_lidar[:3, 3] - before[:3, 3]
+        return _turn_between(before, T_world_lidar), float(np.linalg.norm(moved))
 
 
 def _view(scan: Scan, T_world_lidar: NDArray[np.float64]) -> PlanView:
@@ -253,13 +265,13 @@ def _view(scan: Scan, T_world_lidar: NDArray[np.float64]) -> PlanView:
     return plan_view(_turned(points[:: max(1, len(points) // _POINTS)], level))
 
 
-def _shown(
+def _compared_with(
     reference: _Reference, view: PlanView, T_world_lidar: NDArray[np.float64], scans: int
-) -> ShownMotion | None:
-    """Return what two views show of the motion between them; None where they do not show it."""
+) -> Look:
+    """Return what two views show of the motion between them."""
     moved = (T_world_lidar - reference.T_world_lidar)[:2, 3].astype(np.float32)
     if np.linalg.norm(moved) > _FAR:
-        return None
+        return Look()
     estimated = float(_turn_between(reference.T_world_lidar, T_world_lidar)[2])
     step = FINE if len(view.centers) < _COARSELY else _STEP
 
@@ -269,21 +281,21 @@ def _shown(
 
     found, angle = compared(0.0), 0.0
     if not found.is_certain and not reference.searches_turns:
-        return None
+        return _HIDDEN
     if not found.is_certain:
         every = max(1, len(view.centers) // _COARSELY)
         angle = float(max(_TURN_ERRORS, key=lambda one: compared(one, every).votes))
         straight, found = found.votes, compared(angle)
         is_turned = abs(angle) >= _LEAST_TURN_ERROR
         if not found.is_certain or (is_turned and not leads(found.votes, straight)):
-            return None
+            return _HIDDEN
     shift = found.shift
     if np.linalg.norm(shift) > _UNSUSPICIOUS:
         shift = refined(reference.view, view.points @ turn(angle) + moved, shift)
     error, way = float(np.linalg.norm(shift)), float(np.linalg.norm(moved + shift))
     if abs(angle) < _LEAST_TURN_ERROR:
-        return ShownMotion(error, way, estimated, scans)
-    return ShownMotion(error + _ARM * abs(angle), way, estimated + angle, scans)
+        return Look(ShownMotion(error, way, estimated, scans), False)
+    return Look(ShownMotion(error + _ARM * abs(angle), way, estimated + angle, scans), False)
 
 
 def _turn_between(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -292,5 +304,6 @@ def _turn_between(before: NDArray[np.float64], after: NDArray[np.float64]) -> ND
     return turned
 
 
+_HIDDEN = Look(is_hidden=True)
 _FAR = 15.0
 """Motion beyond which two views have too little in common, m."""

@@ -48,8 +48,8 @@ class ScanResult:
     where they were not counted."""
     shown_motion: ShownMotion | None = None
     """What plan views show of the motion since an earlier scan; None where it was not compared."""
-    shows_motion: bool | None = None
-    """Whether the plan view of this scan shows any displacement; None where it was not looked at."""
+    motion_is_hidden: bool | None = None
+    """Whether that comparison shows no motion without doubt; None where nothing was compared."""
     raw: NDArray[np.float32] | None = None
     """(k, 3) some of the points as recorded, m in the lidar frame of their own firing, for pictures."""
 
@@ -159,7 +159,7 @@ class ResultBuilder:
         self._before = evidence
         T_world_lidar = pose_matrix(registration.T_world_lidar.wxyz_xyz)
         unmatched = evidence.lost or not fed.usable
-        shown_motion, shows_motion = self._check(fed.index, fed.scan, T_world_lidar, unmatched)
+        look = self._check(fed.index, fed.scan, T_world_lidar, unmatched)
         return ScanResult(
             index=fed.index,
             stamp_ns=fed.end_ns,
@@ -171,8 +171,8 @@ class ResultBuilder:
             failure=failure,
             duration=float(fed.scan.duration),
             beams=None if fed.index % _BEAMS_EVERY else beams_of(fed.scan),
-            shown_motion=shown_motion,
-            shows_motion=shows_motion,
+            shown_motion=look.shown,
+            motion_is_hidden=look.is_hidden,
             raw=_some(np.asarray(fed.scan.points)[: fed.count]),
         )
 

@@ -32,6 +32,9 @@ _ROUGH_SCANS = 10
 _UNOBSERVED_M = 20.0
 """Way with an unobserved direction of motion that is tolerated where no inertial samples bridge it, m."""
 
+_HIDDEN_LOOKS = 2
+"""Number of successive plan views without a certain motion from which it counts as hidden."""
+
 
 @dataclass
 class _Evidence:
@@ -42,9 +45,10 @@ class _Evidence:
     unobserved_m: float = 0.0
     contradictions: int = 0
     hidden_m: float = 0.0
-    hides: bool = False
-    since_look: float = 0.0
-    velocity: NDArray[np.float64] | None = None
+    hidden_since_s: float = 0.0
+    hidden_looks: int = 0
+    shown_step: float = 0.0
+    last: tuple[NDArray[np.float64], float] | None = None
     accelerations: deque[float] = field(default_factory=lambda: deque(maxlen=_ROUGH_SCANS))
     unconverged: deque[bool] = field(default_factory=lambda: deque(maxlen=_WINDOW))
     nis: deque[float] = field(default_factory=lambda: deque(maxlen=_WINDOW))
@@ -181,24 +185,22 @@ class Verdict(Sink):
 
     def _note_hidden(self, result: ScanResult, step: float) -> None:
         """Add up the way along which nothing but the recipe's own match shows the motion."""
-        seen = self._seen
+        seen, shown = self._seen, result.shown_motion
         if result.output.covariance is not None:
             return
-        seen.since_look += step
-        if result.shows_motion:
-            seen.hides, seen.hidden_m = False, 0.0
-        elif result.shows_motion is not None and not seen.hides:
-            # it began somewhere since the last look
-            seen.hides, seen.hidden_m = True, seen.since_look / 2
-        elif seen.hides:
-            seen.hidden_m += step
-        if result.shows_motion is not None:
-            seen.since_look = 0.0
-        if seen.hidden_m > max(_UNOBSERVED_M, TOLERATED_SHARE * seen.way):
+        if shown is not None:
+            seen.shown_step = shown.way / shown.scans
+            seen.hidden_looks, seen.hidden_m, seen.hidden_since_s = 0, 0.0, self._now_s
+        # a match that stays behind says that the vehicle stands; it moves on as it was seen to move
+        seen.hidden_m += max(step, seen.shown_step)
+        seen.hidden_looks += _is_true(result.motion_is_hidden)
+        far = seen.hidden_m > max(_UNOBSERVED_M, TOLERATED_SHARE * seen.way)
+        if far and seen.hidden_looks >= _HIDDEN_LOOKS:
             self._doubt(
                 "unobserved",
-                f"up to {self._now_s:.1f} s nothing upright shows the motion over {seen.hidden_m:.0f} m, as "
-                "in a tunnel or on a plain, and no inertial samples bridge it",
+                f"from {seen.hidden_since_s:.1f} s on nothing upright shows the motion, as in a tunnel or on "
+                "a plain, and no inertial samples bridge it",
+                seen.hidden_since_s,
             )
 
     def _note_jumps(self, result: ScanResult) -> None:
@@ -207,14 +209,17 @@ class Verdict(Sink):
         interval = (result.stamp_ns - before.stamp_ns) * 1e-9 if before is not None else 0.0
         restarts = _is_true(output.restarted) or _is_true(output.new_piece) or bool(output.lost)
         if before is None or interval <= 0 or restarts:
-            seen.velocity = None
+            seen.last = None
             seen.accelerations.clear()
             return
-        last, velocity = seen.velocity, (result.T_world_imu - before.T_world_imu)[:3, 3] / interval
-        seen.velocity = velocity
+        last, step = seen.last, (result.T_world_imu - before.T_world_imu)[:3, 3]
+        seen.last = step, interval
         if last is None:
             return
-        seen.accelerations.append(float(np.linalg.norm(velocity - last)) / interval)
+        # some recorders stamp equal sweeps unequally: what is steady by stamps or by count is no jump
+        by_stamps = np.linalg.norm(step / interval - last[0] / last[1]) / interval
+        evenly = np.linalg.norm(step - last[0]) / (interval * last[1])
+        seen.accelerations.append(float(min(by_stamps, evenly)))
         full = len(seen.accelerations) == _ROUGH_SCANS
         rough = float(np.median(seen.accelerations)) if full else 0.0
         if seen.accelerations[-1] > _STRONGEST or rough > _ROUGHEST:

@@ -4,8 +4,6 @@ import sys
 from functools import cache
 from pathlib import Path
 
-import numpy as np
-
 from lio_jax.run.run import imu_feed, settings_for
 from lio_jax.run.track import track
 from lio_jax.settings.settings import recipe_settings, with_overrides
@@ -14,7 +12,11 @@ from lio_jax.sim.sequence import SimulatedSequence
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "experiments" / "bench"))
 
+from hard_runs import moves as steps
+from hard_runs import relative
 from roads import driven_along, road_scene
+
+__all__ = ["relative", "road", "steps", "tracked"]
 
 
 @cache
@@ -35,15 +37,3 @@ def tracked(sequence, recipe, overrides=(), scans=None, start=0):
     settings, _ = settings_for(sequence, with_overrides(recipe_settings(recipe), overrides))
     imu, _ = imu_feed(sequence, settings)
     return settings, list(track(settings, sequence.scans(start) if scans is None else scans, imu))
-
-
-def relative(results, sequence):
-    """Return poses and true poses (n, 4, 4), each relative to the first."""
-    stamps = np.array([one.stamp_ns for one in results])
-    truth = sequence.truth().at(stamps)
-    poses = np.array([one.T_world_imu for one in results])[np.isin(stamps, truth.stamp_ns)]
-    return np.linalg.inv(poses[0]) @ poses, np.linalg.inv(truth.poses[0]) @ truth.poses
-
-
-def steps(poses):
-    return np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)

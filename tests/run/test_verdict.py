@@ -8,8 +8,12 @@ import pytest
 
 from lio_jax.cli import main
 from lio_jax.data.detect import open_sequence
-from lio_jax.run.shown_motion import ShownMotion
+from lio_jax.run.run import settings_for
+from lio_jax.run.scan_inputs import padded
+from lio_jax.run.shown_motion import MotionCheck, ShownMotion
 from lio_jax.run.verdict import Verdict, in_words
+from lio_jax.settings.settings import recipe_settings
+from lio_jax.sim.sequence import SimulatedSequence
 from tests.run.roads import relative, road, steps, tracked
 from tests.run.test_first_velocity import DRIVE
 from tests.shared_data import needs_shared
@@ -69,7 +73,7 @@ def moved(result, number, step):
     pose = result.T_world_imu.copy()
     pose[0, 3] += step
     stamp_ns = result.stamp_ns + number * 100_000_000
-    return replace(result, T_world_imu=pose, stamp_ns=stamp_ns, shown_motion=None, shows_motion=None)
+    return replace(result, T_world_imu=pose, stamp_ns=stamp_ns, shown_motion=None, motion_is_hidden=None)
 
 
 @pytest.mark.parametrize(("jump", "state"), [(0.05, "sound"), (0.7, "doubtful")])
@@ -82,21 +86,65 @@ def test_a_motion_that_jumps_is_noticed(jump, state):
     assert ("jumps" in " ".join(found["reasons"])) == (state != "sound")
 
 
+def test_unequal_stamps_of_equal_sweeps_are_no_jumps():
+    settings, results = tracked(road("street", 25.0, 0.0, 8), "default")
+    # as KITTI's stamps are: 0.1, 0.1 and 0.11 s for sweeps of equal length
+    late = [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4]
+    onwards = [
+        replace(
+            moved(results[-1], number, 2.5 * number),
+            stamp_ns=results[-1].stamp_ns + number * 10**8 + late_by * 10**7,
+        )
+        for number, late_by in enumerate(late[1:], 1)
+    ]
+    assert verdict_of(settings, [*results, *onwards])["state"] == "sound"
+
+
 @pytest.mark.parametrize(
-    ("recipe", "shows", "state"),
-    [
-        ("loam", False, "doubtful"),
-        ("loam", True, "sound"),
-        ("default", False, "sound"),
-    ],
+    ("recipe", "looks", "is_doubted"),
+    [("loam", 2, True), ("loam", 1, False), ("loam", 0, False), ("default", 2, False)],
 )
+@pytest.mark.parametrize("stays", [False, True])
 def test_a_way_along_which_nothing_shows_the_motion_is_doubtful_without_inertial_samples(
-    recipe, shows, state
+    recipe, looks, is_doubted, stays
 ):
     settings, results = tracked(road("street", 25.0, 0.0, 8), recipe)
-    onwards = [moved(results[-1], number, 2.5 * number) for number in range(1, 12)]
-    onwards[0] = replace(onwards[0], shows_motion=shows)
-    assert verdict_of(settings, [*results, *onwards])["state"] == state
+    since = (results[-1].stamp_ns - results[0].stamp_ns) * 1e-9
+    shown = replace(results[-1], shown_motion=ShownMotion(0.0, 7.5, 0.0, 3), motion_is_hidden=False)
+    # a match that stays behind shows no way either
+    onwards = [moved(shown, number, 0.0 if stays else 2.5 * number) for number in range(1, 12)]
+    for number in range(looks):
+        onwards[5 * number] = replace(onwards[5 * number], motion_is_hidden=True)
+    found = verdict_of(settings, [*results[:-1], shown, *onwards])
+    assert any("nothing upright" in reason for reason in found["reasons"]) == is_doubted
+    if is_doubted:
+        assert found["since_s"] == pytest.approx(since, abs=1e-3)
+
+
+def test_what_stays_behind_in_a_tunnel_is_noticed():
+    sequence = SimulatedSequence("tunnel", duration_s=15.0, seed=1)
+    settings, results = tracked(sequence, "loam")
+    poses, truth = relative(results, sequence)
+    error = np.linalg.norm((poses - truth)[:, :3, 3], axis=1)
+    assert error[-1] > 1
+    found = verdict_of(settings, results)
+    assert found["state"] != "sound"
+    assert found["since_s"] <= 0.1 * np.argmax(error > 1)
+
+
+def test_plan_views_are_compared_at_any_speed():
+    sequence = road("street", 35.0, 0.0, 32)
+    settings, _ = settings_for(sequence, recipe_settings("default"))
+    truth = sequence.truth()
+    check, shown = MotionCheck(), {}
+    for index, scan in enumerate(sequence.scans(), 100):
+        pose = truth.at(np.array([scan.end_ns])).poses[0] @ sequence.info.T_imu_lidar
+        look = check(index, padded(scan, None, settings.config.lidar), pose, lost=False)
+        if look.shown is not None:
+            shown[index] = look.shown
+    late = [one for index, one in shown.items() if index > 120]
+    assert late
+    assert all(one.error < 0.5 and one.way > 3 for one in late)
 
 
 @pytest.mark.parametrize("recipe", ["default", "fast_lio2", "lio_sam", "loam"])
