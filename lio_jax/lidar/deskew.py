@@ -63,16 +63,22 @@ class TrialMotion(eqx.Module):
 
     @staticmethod
     def since(
-        last_twist: Float[Array, "6"], since: Float[Array, ""], scan: Scan, first: Bool[Array, ""]
+        twist: Float[Array, "6"],
+        turning: Float[Array, ""],
+        since: Float[Array, ""],
+        scan: Scan,
+        first: Bool[Array, ""],
     ) -> "TrialMotion":
         """Return the motion to a scan's middle.
 
         Args:
-            last_twist: velocity before.
+            twist: velocity at the last scan.
+            turning: share of the turning rate that lasts, 0 to 1.
             since: from the instant that the motion begins at to the last scan's end, s.
             scan: its interval and duration.
             first: no scan was seen before.
         """
+        last_twist = jnp.concatenate([twist[:3], turning * twist[3:]])
         middle = 0.5 * scan.duration.astype(last_twist.dtype)
         # the first scan's end is the world's origin, however many empty scans went before
         interval = jnp.where(first, 0.0, scan.interval.astype(last_twist.dtype))

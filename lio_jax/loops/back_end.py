@@ -337,7 +337,8 @@ class BackEnd:
         """Add the newest keyframe's fix; return whether this fix makes the heading known."""
         keyframe, pose = self._keyframes[-1], self._poses[-1]
         covariance = pose[:3, :3] @ self._since_fix[3:, 3:] @ pose[:3, :3].T if self._aligned else None
-        fix = gate.used_fix(keyframe.stamp_ns, keyframe.T_odom_imu, pose, covariance)
+        poses = keyframe.T_odom_imu, pose
+        fix = gate.used_fix(keyframe.stamp_ns, *poses, covariance, keyframe.position_error)
         if isinstance(fix, Refusal):
             return False
         self._since_fix = np.zeros((6, 6))

@@ -20,6 +20,7 @@ from lio_jax.loops.proposals import (
     is_old,
     keyframe_at,
     metres_from,
+    metres_of,
     nearest_proposal,
     possible_error,
     read_pairs,
@@ -152,7 +153,8 @@ class LoopCloser:
         self._consensus = Consensus(limits)
         self._pairs = read_pairs(Path(sizes.pairs)) if sizes.pairs else []
         self._run: list[float] = []
-        """Length of the odometry's path from the first keyframe to each one, m."""
+        """Length of the odometry's path from the first keyframe to each one, m. An outage counts as the way
+        after which drift is as large as the outage's error."""
         self._refused: list[Verdict] = []
         self._without_keyframes: list[Pair] = []
 
@@ -181,13 +183,14 @@ class LoopCloser:
         """
         self._places.add(keyframes[-1])
         step = keyframes[-1].T_odom_imu[:3, 3] - keyframes[-2 if len(keyframes) > 1 else -1].T_odom_imu[:3, 3]
-        self._run.append(self._run[-1] + float(np.linalg.norm(step)) if self._run else 0.0)
+        metres = float(np.linalg.norm(step)) + metres_of(keyframes[-1], self._limits)
+        self._run.append(self._run[-1] + metres if self._run else 0.0)
         run = np.array(self._run)
         ends = held_by(poses, self._consensus.entered)
-        metres = metres_from(len(keyframes) - 1, run, ends)
+        ways = metres_from(len(keyframes) - 1, run, ends)
         old = is_old(keyframes, len(keyframes) - 1, self._limits["time_gap"])
-        proposals = nearest_proposal(poses, old, metres, self._limits)
-        proposals += described_proposals(self._places, poses, old, metres, self._limits)
+        proposals = nearest_proposal(poses, old, ways, self._limits)
+        proposals += described_proposals(self._places, poses, old, ways, self._limits)
         while self._pairs and self._pairs[0].later_ns <= keyframes[-1].stamp_ns:
             proposals += self._from_outside(self._pairs.pop(0), keyframes, poses, run, ends)
         return proposals

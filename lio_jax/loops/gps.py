@@ -229,6 +229,8 @@ class _Witness:
     fix: Fix
     antenna: _Array
     way: float
+    lost: float
+    """Sum of the outages' largest errors up to here, m."""
 
 
 class GpsGate:
@@ -256,6 +258,7 @@ class GpsGate:
         self._elevation = elevation
         self._lever = np.asarray(values["lever_arm"], np.float64)
         self._way = 0.0
+        self._lost = 0.0
         self._speed = 0.0
         self._last: tuple[int, _Array] | None = None
         self._last_used: _Array | None = None
@@ -264,7 +267,12 @@ class GpsGate:
         """Number of keyframes without a fix, by reason."""
 
     def used_fix(
-        self, stamp_ns: int, T_odom_imu: _Array, T_world_imu: _Array, pose_covariance: _Array | None = None
+        self,
+        stamp_ns: int,
+        T_odom_imu: _Array,
+        T_world_imu: _Array,
+        pose_covariance: _Array | None = None,
+        position_error: float = 0.0,
     ) -> Fix | Refusal:
         """Return the fix of the next keyframe, or the reason why it has none.
 
@@ -275,7 +283,10 @@ class GpsGate:
             T_world_imu: (4, 4) its pose, corrected so far, m; its height is used if that of the fixes is not.
             pose_covariance: (3, 3) covariance of its position in the fixes' frame, m^2; None before the
                 alignment.
+            position_error: largest error of the odometry's position since the keyframe before, beyond its
+                drift, m; above 0 after an outage.
         """
+        self._lost += position_error
         antenna = T_odom_imu[:3, :3] @ self._lever + T_odom_imu[:3, 3]
         self._move(stamp_ns, antenna)
         found = self._chosen(stamp_ns, antenna, T_world_imu, pose_covariance)
@@ -310,7 +321,7 @@ class GpsGate:
             return Refusal.VARIANCE
         height = T_world_imu[2, :3] @ self._lever + T_world_imu[2, 3]
         fix = self._trusted(fix, float(height))
-        witness = _Witness(fix, antenna, self._way)
+        witness = _Witness(fix, antenna, self._way, self._lost)
         possible = self._fits_most(witness)
         if not self._witnesses or _apart(antenna, self._witnesses[-1].antenna) >= values["spacing"]:
             self._witnesses.append(witness)
@@ -363,10 +374,8 @@ class GpsGate:
         by_fixes = _apart(one.fix.position[axes], other.fix.position[axes])
         by_odometry = _apart(one.antenna[axes], other.antenna[axes])
         variance = np.linalg.eigvalsh((one.fix.covariance + other.fix.covariance)[axes, axes])[-1]
-        allowed = self._values["jump_sigmas"] * np.sqrt(variance) + self._values["drift"] * (
-            one.way - other.way
-        )
-        return bool(abs(by_fixes - by_odometry) <= allowed)
+        drift = self._values["drift"] * (one.way - other.way) + one.lost - other.lost
+        return bool(abs(by_fixes - by_odometry) <= self._values["jump_sigmas"] * np.sqrt(variance) + drift)
 
 
 def _apart(one: _Array, other: _Array) -> float:

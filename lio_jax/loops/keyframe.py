@@ -22,6 +22,31 @@ class Keyframe:
     covariance: NDArray[np.float64]
     """(6, 6) covariance of the pose's error since the previous keyframe: right perturbation, rotation (rad)
     before translation (m)."""
+    position_error: float = 0.0
+    """Largest error of the position since the previous keyframe beyond the odometry's drift, m: where a new
+    piece of map begins after an outage."""
+    heading_error: float = 0.0
+    """Largest error of the heading since the previous keyframe beyond the odometry's drift, rad."""
+
+    @property
+    def begins_piece(self) -> bool:
+        """Return whether a new piece of map begins with the keyframe."""
+        return self.position_error > 0
+
+
+def same_piece(keyframes: Sequence[Keyframe], centre: int, members: Iterable[int]) -> list[int]:
+    """Return those of some keyframes between which and a given one no new piece of map begins.
+
+    Args:
+        keyframes: all keyframes.
+        centre: index of the given keyframe.
+        members: indices of the keyframes.
+    """
+    return [
+        k
+        for k in members
+        if not any(between.begins_piece for between in keyframes[min(k, centre) + 1 : max(k, centre) + 1])
+    ]
 
 
 def level_points(

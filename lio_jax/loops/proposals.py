@@ -52,6 +52,20 @@ def possible_error(metres: NDArray[np.float64] | float, limits: Mapping[str, Any
     return Error(position, np.asarray(heading))
 
 
+def metres_of(keyframe: Keyframe, limits: Mapping[str, Any]) -> float:
+    """Return the length of odometry after which drift is as large as the error of an outage, m.
+
+    It is 0 where no outage ends with the keyframe. A drift of zero cannot stand for an outage's error; the
+    other one of the two then decides.
+
+    Args:
+        keyframe: the first one after the outage.
+        limits: ``params.loop`` as plain numbers.
+    """
+    errors = (keyframe.position_error, limits["drift"]), (keyframe.heading_error, limits["heading_drift"])
+    return max((error / drift for error, drift in errors if drift > 0), default=0.0)
+
+
 def metres_from(
     source: int, run: NDArray[np.float64], closed: Sequence[tuple[int, int]]
 ) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.core.leaf import numbers_of, traced
 from lio_jax.loops.alignment import aligned
-from lio_jax.loops.keyframe import Keyframe, level_points, padded, thinned
+from lio_jax.loops.keyframe import Keyframe, level_points, padded, same_piece, thinned
 from lio_jax.loops.overlap import LEAST_POINTS, Candidate, CloudComparison, conflict
 from lio_jax.loops.params import AlignmentParams, BackEndSettings
 from lio_jax.loops.proposals import Proposal, is_old, possible_error
@@ -179,9 +179,10 @@ def verify(
         return refused(proposal, f"keyframe {proposal.twin}, where it cannot be, looks as much alike")
     old = is_old(keyframes, source, limits["time_gap"])
     around = range(max(0, target - sizes.submap_keyframes), target + sizes.submap_keyframes + 1)
-    members = [k for k in around if k < len(keyframes) and (old[k] or k == target)]
+    whole = [k for k in around if k < len(keyframes) and (old[k] or k == target)]
+    members = same_piece(keyframes, target, whole)
     theirs = level_points(keyframes, poses, target, members, TARGET_REACH)
-    before = range(max(0, source - sizes.source_keyframes + 1), source + 1)
+    before = same_piece(keyframes, source, range(max(0, source - sizes.source_keyframes + 1), source + 1))
     ours = level_points(keyframes, poses, source, before, SOURCE_REACH)
     theirs, ours = thinned(theirs, _SPACING), thinned(ours, _SPACING)
     their_cells, their_upright = upright_cells(theirs)

@@ -222,13 +222,14 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
         with jax.named_scope("predict"):
             if imu is None:
                 to_end = scan.duration.astype(state.to_end.dtype) / 2
+                rate = state.rate * Outage.turning(params, state.unmatched, scan)
                 scan = until_its_middle(scan, state.to_end)
                 # the first scan's end is the world's origin
-                opened = carried_on(state.uncertain.nav, state.rate, jnp.where(first, -to_end, 0.0))
+                opened = carried_on(state.uncertain.nav, rate, jnp.where(first, -to_end, 0.0))
                 last = NavEstimate(opened, state.uncertain.covariance)
-                prior, path = predicted_without_samples(params, last, state.rate, scan, first)
+                prior, path = predicted_without_samples(params, last, rate, scan, first)
             else:
-                to_end = jnp.zeros_like(state.to_end)
+                to_end, rate = jnp.zeros_like(state.to_end), state.rate
                 # as FAST-LIO2 does, the match is taken for one of the pose at the scan's end
                 prior, path = predicted(params, state.uncertain, scan, imu, first, sweep_start=scan.duration)
             T_predicted = lidar_pose(prior.nav)
@@ -278,7 +279,7 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
         drift = state.drift.carried(state.uncertain.nav.T_world_imu, posterior.nav.T_world_imu)
         posterior, drift = in_new_piece(posterior, drift, jnp.zeros_like(to_end), new_piece)
         seen = jnp.any(thin.mask)
-        rate = jnp.where(first | lost, state.rate, mean_rate(state.uncertain.nav, posterior.nav, scan))
+        rate = jnp.where(first | lost, rate, mean_rate(state.uncertain.nav, posterior.nav, scan))
         new_state = FastLio2State(
             nav=carried_on(posterior.nav, rate, to_end) if imu is None else posterior.nav,
             uncertain=posterior,

@@ -89,7 +89,8 @@ def step(
         thin = thinned(params.lidar, scan, params.map.point_spacing, spacing, *sizes)
     with jax.named_scope("predict"):
         first, T_last = state.scans == 0, state.T_world_lidar
-        motion = TrialMotion.since(state.twist, state.mid_to_end, scan, first)
+        turning = Outage.turning(params, state.unmatched, scan)
+        motion = TrialMotion.since(state.twist, turning, state.mid_to_end, scan, first)
         prediction = T_last @ motion.predicted()
         outage = Outage.at(params, state.unmatched + scan.interval, thin.matched.mask)
 
@@ -108,7 +109,7 @@ def step(
         result = gauss_newton(match, config.registration.max_iterations)
         lost = (result.status == LOST) & ~first
         new_piece = outage.begins_piece(lost, params.registration)
-        twist = jnp.where(lost, state.twist, motion.twist_to(T_last.inverse() @ result.T_world_lidar))
+        twist = jnp.where(lost, motion.last_twist, motion.twist_to(T_last.inverse() @ result.T_world_lidar))
         missed = jnp.linalg.norm((prediction.inverse() @ result.T_world_lidar).translation())
         error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
         # it only opens the kernel, which is closed at the solution

@@ -201,7 +201,8 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
                 jnp.sum(features.sharp.mask) + jnp.sum(features.flat.mask) > params.registration.min_matches
             )
         with jax.named_scope("predict"):
-            motion = TrialMotion.since(state.twist, state.since, scan, first)
+            turning = Outage.turning(params, state.unmatched, scan)
+            motion = TrialMotion.since(state.twist, turning, state.since, scan, first)
             middle = motion.middle
         with jax.named_scope("scan_to_scan"):
             picks = _Compensated(features.sharp, features.flat, motion, config.loam.compensate)

@@ -146,6 +146,22 @@ class Outage(eqx.Module):
         """
         return lost & self.is_long & (self.usable >= _ENOUGH * registration.min_matches)
 
+    @staticmethod
+    def turning(params: RecipeParams, unmatched: Float[Array, ""], scan: Scan) -> Float[Array, ""]:
+        """Return the share of the turning rate that lasts over a scan's interval without samples, 0 to 1.
+
+        A vehicle keeps its velocity longer than its turning rate. A rate that is carried on through a long
+        outage tilts the world.
+
+        Args:
+            params: ``params.limits.outage``, the time for which the turn goes on, s.
+            unmatched: time from the last scan that was matched to the last scan's end, s.
+            scan: its interval.
+        """
+        left = jnp.maximum(params.limits.outage - unmatched, 0.0)
+        interval = scan.interval.astype(left.dtype)
+        return jnp.minimum(left / jnp.where(interval > 0, interval, 1.0), 1.0)
+
     def after(self, unmatched: Bool[Array, ""]) -> Float[Array, ""]:
         """Return the time since the last match after this scan, s; ``unmatched``: it was not matched."""
         return jnp.where(unmatched, self.elapsed, 0.0)

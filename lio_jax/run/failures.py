@@ -172,6 +172,66 @@ def longest_gap(samples: ImuBatch, start: float, end: float) -> float:
     return float(np.max(np.diff(within)[inner], initial=0.0))
 
 
+_SPEEDS_UP = 1.0
+"""Acceleration of a body that nothing measures, m/s^2."""
+_LARGEST = 3.0
+"""Largest error, in standard deviations."""
+
+
+@dataclass(frozen=True)
+class Outage:
+    """The time without a match before a new piece of map, and the possible error of that piece's pose."""
+
+    duration: float
+    """Time since the last scan that was matched, s."""
+    covariance: NDArray[np.float64] | None
+    """(6, 6) covariance of the pose's right perturbation, rotation (rad) before translation (m); None where
+    the recipe has none."""
+    position: float
+    """Largest error of the position, m."""
+    heading: float
+    """Largest error of the heading, rad."""
+
+
+class OutageWatch:
+    """Notes when scans were matched, and returns the outage where a new piece of map begins."""
+
+    def __init__(self) -> None:
+        self._matched_ns: int | None = None
+        self._speed = 0.0
+
+    def __call__(self, stamp_ns: int, now: ScanEvidence, covariance: Any) -> Outage | None:
+        """Return the outage that ends with a scan; None for all other scans.
+
+        Args:
+            stamp_ns: the scan's end, ns.
+            now: evidence of the scan.
+            covariance: (24, 24) covariance of the navigation state; None where the recipe has none.
+        """
+        ended = None
+        if now.new_piece:
+            since = stamp_ns if self._matched_ns is None else self._matched_ns
+            ended = _outage((stamp_ns - since) * 1e-9, self._speed, covariance)
+        if now.new_piece or not now.lost:
+            self._matched_ns = stamp_ns
+            self._speed = float(np.linalg.norm(now.nav.velocity))
+        return ended
+
+
+def largest_sigma(covariance: NDArray[np.float64]) -> float:
+    """Return the largest standard deviation over all directions of a (3, 3) covariance."""
+    known = bool(np.isfinite(covariance).all())
+    return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0))) if known else np.inf
+
+
+def _outage(duration: float, speed: float, covariance: Any) -> Outage:
+    if covariance is None:
+        return Outage(duration, None, speed * duration + _SPEEDS_UP / 2 * duration**2, np.pi)
+    pose = np.array(covariance, np.float64)[:6, :6]
+    position, rotation = (_LARGEST * largest_sigma(block) for block in (pose[3:, 3:], pose[:3, :3]))
+    return Outage(duration, pose, position, min(rotation, np.pi))
+
+
 def _match_failure(now: ScanEvidence, settings: Settings) -> str:
     found = now.registration
     if now.points == 0:

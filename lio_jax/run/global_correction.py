@@ -129,7 +129,7 @@ class GlobalCorrection(Sink):
         found = self._thread.finish(hurry=run.interruption is not None)
         run.odometry = odometry = run.trajectory
         run.metrics["backend"] = self._summary(found)
-        run.metrics["warnings"] += self._warnings()
+        run.metrics["warnings"] += (*self._warnings(), *self._pieces(found, odometry))
         if not len(found.stamp_ns):
             return
         poses = corrected_poses(
@@ -200,6 +200,22 @@ class GlobalCorrection(Sink):
         kind = type(error).__name__
         ended = f"the back end ended early ({kind}: {error}); what it had done until then counts."
         return (*self.notes, *self._unused_pairs(), *((ended,) if error else ()))
+
+    def _pieces(self, found: Correction, odometry: Trajectory) -> list[str]:
+        """Return a sentence on each piece of map after an outage: what ties it to the map before."""
+        sentences = []
+        for piece in self._picker.pieces:
+            at_s = (self._picker.stamps_ns[piece] - int(odometry.stamp_ns[0])) * 1e-9
+            loops = sum(
+                verdict.proposal.target < piece <= verdict.proposal.source
+                for verdict, weight in found.loops
+                if weight is not None and weight > 0.5
+            )
+            by = [f"{loops} loops"] * (loops > 0) + ["the GPS fixes"] * (found.T_enu_world is not None)
+            tie = f"{' and '.join(by)} tie" if by else "nothing ties"
+            end = "" if by else "; its place there is predicted"
+            sentences.append(f"a new piece of map begins at {at_s:.1f} s: {tie} it to the map before{end}.")
+        return sentences
 
     def _unused_pairs(self) -> list[str]:
         pairs = self._closer.untried() if self._closer else []

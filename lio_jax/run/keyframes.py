@@ -15,6 +15,7 @@ from lio_jax.core.files import atomic_path, read_arrays
 from lio_jax.core.geometry import carried
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.pose_graph.g2o import G2oEdge
+from lio_jax.run.failures import Outage
 from lio_jax.run.track import ScanResult
 from lio_jax.settings.settings import Settings
 
@@ -34,29 +35,42 @@ class KeyframePicker:
         self._failed = False
         self.stamps_ns: list[int] = []
         """Stamps of the keyframes so far, ns."""
+        self.pieces: list[int] = []
+        """Indices of the keyframes with which a new piece of map begins after an outage."""
 
     def __call__(self, tracked: ScanResult) -> Keyframe | None:
         """Return the scan as a keyframe, or None if it is not one.
 
-        The covariance between two keyframes is that of ``params.backend``; it is large if a scan between them
-        failed.
+        The covariance between two keyframes is that of ``params.backend``. It is large if a scan between them
+        failed, and that of the pose where a new piece of map begins. A scan that was not matched gives a pose
+        without points: where the points are is not known.
         """
-        T = tracked.T_world_imu
+        T, outage = tracked.T_world_imu, tracked.outage
         self._failed |= bool(tracked.failure)
-        if not np.isfinite(T).all() or (
-            self._last and not is_keyframe(self._last.T_odom_imu, T, self._distance, self._angle)
-        ):
+        moved = self._last is None or is_keyframe(self._last.T_odom_imu, T, self._distance, self._angle)
+        if not np.isfinite(T).all() or not (moved or outage):
             return None
+        points = points_in_imu(tracked)
         self._last = Keyframe(
             index=0 if self._last is None else self._last.index + 1,
             stamp_ns=tracked.stamp_ns,
             T_odom_imu=T,
-            points=points_in_imu(tracked),
-            covariance=_LOOSE if self._failed else self._covariance,
+            points=points[:0] if bool(tracked.output.lost) and outage is None else points,
+            covariance=_across(outage) if outage else _LOOSE if self._failed else self._covariance,
+            position_error=outage.position if outage else 0.0,
+            heading_error=outage.heading if outage else 0.0,
         )
         self._failed = False
         self.stamps_ns.append(tracked.stamp_ns)
+        self.pieces += [self._last.index] if outage else []
         return self._last
+
+
+def _across(outage: Outage) -> NDArray[np.float64]:
+    """Return the covariance of the pose across an outage, (6, 6)."""
+    if outage.covariance is not None and np.isfinite(outage.covariance).all():
+        return outage.covariance + _LOOSE
+    return np.diag([outage.heading**2] * 3 + [outage.position**2] * 3)
 
 
 def points_in_imu(tracked: ScanResult) -> NDArray[np.float32]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.types import CONVERGED, ITERATION_LIMIT
+from lio_jax.run.failures import largest_sigma
 from lio_jax.run.sinks import RunResult, Sink
 from lio_jax.run.track import ScanResult
 from lio_jax.settings.settings import Settings
@@ -118,21 +119,18 @@ class Verdict(Sink):
         unmatched = self._seen.unmatched_since_s
         if lost and unmatched is None and before is not None:
             unmatched = (before.stamp_ns - (self._first_ns or 0)) * 1e-9
-        if _is_true(output.new_piece):
-            assert unmatched is not None
-            gap = self._now_s - unmatched
+        if (outage := result.outage) is not None:
             sigma = _sigma(output.covariance)
-            speed = float(np.linalg.norm(before.nav.velocity)) if before is not None else 0.0
-            error = gap * speed if sigma is None else sigma
+            error = outage.position if sigma is None else sigma
             if error > TOLERATED_M or error > TOLERATED_SHARE * self._seen.way:
                 known = (
                     "its error is unknown" if sigma is None else f"its standard deviation is {sigma:.1f} m"
                 )
                 self._doubt(
                     "outage",
-                    f"no scan was matched for {gap:.1f} s up to {self._now_s:.1f} s; the map goes on from "
-                    f"the predicted pose, and {known}",
-                    unmatched,
+                    f"no scan was matched for {outage.duration:.1f} s up to {self._now_s:.1f} s; the map "
+                    f"goes on from the predicted pose, and {known}",
+                    self._now_s - outage.duration,
                 )
             lost = False
         self._seen.unmatched_since_s = unmatched if lost else None
@@ -242,9 +240,4 @@ def in_words(verdict: dict[str, Any]) -> str:
 
 def _sigma(covariance: NDArray[np.float64] | None) -> float | None:
     """Return the largest standard deviation of the position over all directions, m."""
-    if covariance is None:
-        return None
-    position = np.asarray(covariance)[3:6, 3:6]
-    return (
-        float(np.sqrt(max(np.linalg.eigvalsh(position)[-1], 0.0))) if np.isfinite(position).all() else np.inf
-    )
+    return None if covariance is None else largest_sigma(np.asarray(covariance)[3:6, 3:6])

@@ -1,10 +1,13 @@
 """Loops one keyframe after the other: none is lost, and similar places are not confused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from loops import closed, error_of, revisits, town
+from loops import absolute_error, closed, error_of, revisits, town
 
 from lio_jax.loops.closing import LoopCloser, held_by
+from lio_jax.loops.keyframe import same_piece
 from lio_jax.loops.proposals import Proposal
 from lio_jax.loops.verification import Verdict
 from lio_jax.settings.settings import Settings
@@ -115,3 +118,49 @@ def test_a_loop_among_doubtful_places_has_to_be_confirmed_by_more_than_there_are
         assert closer.settle([verdict(source, source - 48)], keyframes) == []
     entering = closer.settle([verdict(57, 9)], keyframes)
     assert [loop.proposal.source for loop in entering] == [53, 54, 55, 56, 57]
+
+
+def across_an_outage(keyframes, at, shift, yaw, known=True):
+    """Return keyframes whose odometry is off by a step from one of them on, as after an outage there."""
+    moved = []
+    for one in keyframes:
+        if one.index < at:
+            moved.append(one)
+            continue
+        T = keyframes[at - 1].T_odom_imu @ shift_of(shift, yaw) @ np.linalg.inv(keyframes[at - 1].T_odom_imu)
+        begins = known and one.index == at
+        moved.append(
+            replace(
+                one,
+                T_odom_imu=T @ one.T_odom_imu,
+                covariance=np.diag([0.1**2] * 3 + [10.0**2] * 3) if begins else one.covariance,
+                position_error=40.0 if begins else 0.0,
+                heading_error=0.4 if begins else 0.0,
+            )
+        )
+    return moved
+
+
+def shift_of(shift, yaw):
+    T = pose(*shift)
+    T[:3, :3] = pose(yaw=yaw)[:3, :3]
+    return T
+
+
+def test_loops_tie_the_pieces_of_a_map_on_both_sides_of_an_outage(twice_around_a_block):
+    keyframes, truth = twice_around_a_block
+    middle = len(keyframes) // 2
+    broken = across_an_outage(keyframes, middle, (25.0, -15.0), 0.2)
+    before = np.array([one.T_odom_imu for one in broken])
+    assert absolute_error(before, truth) > 8
+    closer, found, _ = closed(broken)
+    across = [one for one in closer.closed if one.proposal.target < middle <= one.proposal.source]
+    assert len(across) > 30
+    _, whole, _ = closed(keyframes)
+    assert absolute_error(found.T_world_imu, truth) < 1.2 * absolute_error(whole.T_world_imu, truth) + 0.1
+
+
+def test_a_submap_ends_where_another_piece_of_map_begins():
+    keyframes = across_an_outage([keyframe(k, pose(k)) for k in range(8)], 4, (9.0, 0.0), 0.0)
+    assert same_piece(keyframes, 2, range(8)) == [0, 1, 2, 3]
+    assert same_piece(keyframes, 4, range(8)) == same_piece(keyframes, 6, range(8)) == [4, 5, 6, 7]

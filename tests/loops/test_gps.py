@@ -16,14 +16,15 @@ def values(**changed):
     return Settings().values["gps"] | {"lever_arm": LEVER.tolist()} | changed
 
 
-def choices(recorded, elevation=True, pose_covariance=None, corrected=None, **changed):
+def choices(recorded, elevation=True, pose_covariance=None, corrected=None, position_error=None, **changed):
     """Return what each keyframe gets, and the gate."""
     gate = GpsGate(recorded.fix_ns, recorded.fix, recorded.covariance, values(**changed), elevation)
     corrected = recorded.T_odom_imu if corrected is None else corrected
+    errors = np.zeros(len(corrected)) if position_error is None else position_error
     found = [
-        gate.used_fix(stamp, T, T_world_imu, pose_covariance)
-        for stamp, T, T_world_imu in zip(
-            recorded.stamp_ns.tolist(), recorded.T_odom_imu, corrected, strict=True
+        gate.used_fix(stamp, T, T_world_imu, pose_covariance, error)
+        for stamp, T, T_world_imu, error in zip(
+            recorded.stamp_ns.tolist(), recorded.T_odom_imu, corrected, errors, strict=True
         )
     ]
     return found, gate
@@ -78,6 +79,18 @@ def test_an_outage_leaves_keyframes_alone():
     assert not np.any((numbers > 82) & (numbers < 128))
     assert np.any(numbers > 130)
     assert gate.refusals[Refusal.TIME] > 40
+
+
+def test_fixes_are_used_at_once_where_the_odometry_goes_on_elsewhere_after_an_outage():
+    recorded = drive()
+    recorded.T_odom_imu[100:, :3, 3] += [30.0, -20.0, 0.0]
+    wrong = np.zeros(200)
+    refused, _ = choices(recorded)
+    wrong[100] = 40.0
+    found, gate = choices(recorded, position_error=wrong)
+    assert not set(range(101, 120)) & set(used(refused))
+    assert set(range(101, 120)) & set(used(found))
+    assert Refusal.JUMP not in gate.refusals
 
 
 def test_no_fixes_at_all():

@@ -5,11 +5,16 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from lio_jax.run.keyframes import KeyframePicker
+from lio_jax.run.run import run_sequence, settings_for
 from lio_jax.run.verdict import Verdict
+from lio_jax.settings.settings import recipe_settings, with_overrides
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
-from tests.run.roads import relative, steps, tracked
+from tests.run.roads import relative, road, steps, tracked
+from tests.run.small_drive import Replay
 
 BEFORE, AWAY, AFTER = 30, 100, 30
 RECIPES = ["default", "fast_lio2", "lio_sam", "loam"]
@@ -79,3 +84,42 @@ def test_without_an_outage_no_piece_begins(recipe):
     sequence, before, _ = drive()
     _, results = tracked(sequence, recipe, scans=before)
     assert not any(bool(one.output.new_piece) for one in results)
+
+
+@pytest.mark.parametrize("recipe", ["default", "loam"])
+def test_a_new_piece_is_a_keyframe_that_knows_how_wrong_it_may_be(recipe):
+    sequence, scans = with_blocked()
+    settings, results = tracked(sequence, recipe, scans=scans)
+    pick = KeyframePicker(settings)
+    keyframes = [picked for one in results if (picked := pick(one)) is not None]
+    (begin,) = [one for one in keyframes if one.begins_piece]
+    assert pick.pieces == [begin.index]
+    assert begin.stamp_ns == results[BEFORE + AWAY].stamp_ns
+    error = np.subtract(*(one[BEFORE + AWAY, :3, 3] for one in relative(results, sequence)))
+    assert np.linalg.norm(error) < begin.position_error < 500
+    assert np.trace(begin.covariance[3:, 3:]) > np.linalg.norm(error) ** 2 / 9
+    lost = {one.stamp_ns for one in results if bool(one.output.lost)} - {begin.stamp_ns}
+    assert all(len(one.points) == 0 for one in keyframes if one.stamp_ns in lost)
+    assert all(len(one.points) > 100 for one in keyframes if one.stamp_ns not in lost)
+
+
+def test_a_run_says_whether_anything_ties_the_pieces(tmp_path):
+    sequence, scans = without_scans()
+    settings = with_overrides(recipe_settings("default"), ["config.backend.loops=true"])
+    recording = Replay(scans)
+    recording.info, recording.imu, recording.truth = sequence.info, sequence.imu, sequence.truth
+    result = run_sequence(recording, settings_for(recording, settings)[0], tmp_path / "run")
+    (said,) = [words for words in result.metrics["warnings"] if "a new piece of map" in words]
+    assert said.endswith("nothing ties it to the map before; its place there is predicted.")
+
+
+@pytest.mark.parametrize("recipe", ["default", "fast_lio2", "loam"])
+def test_a_turn_that_nothing_measures_does_not_go_on_through_an_outage(recipe):
+    sequence = road("street", 8.0, 0.5, 80, imu=False)
+    scans = list(sequence.scans())
+    covered = (*scans[:20], *map(blocked, scans[20:70]), *scans[70:])
+    _, results = tracked(sequence, recipe, scans=covered)
+    R = [one.T_world_imu[:3, :3] for one in results]
+    assert Rotation.from_matrix(R[19].T @ R[69]).magnitude() < 0.5 * 1.5
+    moved = np.linalg.norm(results[69].T_world_imu[:3, 3] - results[19].T_world_imu[:3, 3])
+    assert moved == pytest.approx(8.0 * 5, rel=0.1)
