@@ -5,16 +5,19 @@ python experiments/bench/hard_cases.py drive --recording KITTI_RAW_DRIVE --start
 python experiments/bench/hard_cases.py outages [--json FILE]
 python experiments/bench/hard_cases.py scenes [--seeds 3]
 python experiments/bench/hard_cases.py set-ups [--recipes default] [--seeds 7]
+python experiments/bench/hard_cases.py verdicts [--seeds 2] [--recording DRIVE ANOTHER_DRIVE]
 
 A scene is passed if the error stays below one percent of the way, or a warning comes before the error exceeds
 one metre. A wrong set-up is found if a fault is named within 20 s. A start is right if every move after the
-third scan is within 5 % of the true one, and the last position within 5 % of the way. A miss is a start that
-is not right and whose verdict is sound. --recipes takes the peers too: kiss-icp and rko-lio.
+third scan is within 5 % of the true one, and the last position within 5 % of the way. A trajectory is wrong
+from the instant at which its error exceeds 1 m, or 0.3 m and 5 % of the way. A miss is a wrong trajectory
+that is called sound until then; a false alarm is a right one that is not called sound. --recipes takes the
+peers too: kiss-icp and rko-lio.
 """
 
 import argparse
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from itertools import product
@@ -28,9 +31,9 @@ from roads import driven_along, road_scene
 
 from lio_jax.commands.runtime import prepare_jax
 from lio_jax.data.detect import open_sequence
-from lio_jax.data.sequence import LidarScan
+from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.sim.imu import ImuModel
-from lio_jax.sim.sequence import SimulatedSequence
+from lio_jax.sim.sequence import WORLDS, SimulatedSequence
 
 Row = dict[str, Any]
 
@@ -60,7 +63,7 @@ def starts(options: argparse.Namespace) -> list[Row]:
             ratio = moves(estimated)[2:] / moves(true)[2:]
             error = np.linalg.norm((estimated - true)[-1, :3, 3])
             right = bool(np.abs(ratio - 1).max() < 0.05 and error < 0.05 * moves(true).sum())
-            missed = not right and run.verdict["state"] == "sound"
+            missed = is_wrong(estimated, true).any() and run.verdict["state"] == "sound"
             rows.append(
                 {
                     "recipe": recipe,
@@ -69,7 +72,7 @@ def starts(options: argparse.Namespace) -> list[Row]:
                     "speed": speed,
                     "seed": seed,
                     "right": right,
-                    "missed": missed,
+                    "missed": bool(missed),
                 }
             )
     print(
@@ -84,10 +87,17 @@ def starts(options: argparse.Namespace) -> list[Row]:
     return rows
 
 
+def is_wrong(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Return at which of (n, 4, 4) poses, relative to the first, the trajectory is wrong."""
+    error = np.linalg.norm((estimated - true)[:, :3, 3], axis=1)
+    way = np.concatenate([[0.0], np.cumsum(moves(true))])
+    return (error > 1.0) | (error > np.maximum(0.3, 0.05 * way))
+
+
 def drive(options: argparse.Namespace) -> list[Row]:
     """Return errors of a recorded drive that is begun in motion."""
     rows = []
-    sequence = open_sequence(options.recording)
+    sequence = open_sequence(options.recording[0])
     print("| recipe | from scan | speed, scans 1 to 3 | way, error | height, error | unconverged | verdict |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for recipe, start in product(options.recipes, options.starts):
@@ -200,6 +210,52 @@ def scenes(options: argparse.Namespace) -> list[Row]:
     return rows
 
 
+def verdicts(options: argparse.Namespace) -> list[Row]:
+    """Return which trajectories are wrong and which are not called sound, over all worlds and recordings."""
+    rows = []
+    print("| recipe | drive | way, m | largest error, m | wrong at, s | verdict | since, s |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for name, sequence in _drives(options):
+        scans = list(sequence.scans())
+        for recipe in options.recipes:
+            run = judged(sequence, scans, recipe, options.lidar_only)
+            estimated, true = relative(run.results, sequence)
+            stamps = np.array([one.stamp_ns for one in run.results])
+            known = np.isin(stamps, sequence.truth().at(stamps).stamp_ns)  # type: ignore[union-attr]
+            wrong = stamps[known][is_wrong(estimated, true)]
+            wrong_s = float(wrong[0] - stamps[0]) * 1e-9 if len(wrong) else None
+            state, since = run.verdict["state"], run.verdict["since_s"]
+            missed = wrong_s is not None and (since is None or since > wrong_s)
+            error = float(np.linalg.norm((estimated - true)[:, :3, 3], axis=1).max())
+            rows.append(
+                {"recipe": recipe, "drive": name, "error_m": error, "wrong_s": wrong_s, "state": state}
+                | {"since_s": since, "missed": missed, "false": wrong_s is None and since is not None}
+            )
+            words = ["-" if value is None else f"{value:.1f}" for value in (wrong_s, since)]
+            print(
+                f"| {recipe} | {name} | {moves(true).sum():.0f} | {error:.2f} | {words[0]} | {state} | "
+                f"{words[1]} |",
+                flush=True,
+            )
+    print("\n| recipe | runs | wrong | of them missed | right | of them false alarms |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for recipe in options.recipes:
+        own = [row for row in rows if row["recipe"] == recipe]
+        wrong_ones = sum(row["wrong_s"] is not None for row in own)
+        print(
+            f"| {recipe} | {len(own)} | {wrong_ones} | {sum(row['missed'] for row in own)} | "
+            f"{len(own) - wrong_ones} | {sum(row['false'] for row in own)} |"
+        )
+    return rows
+
+
+def _drives(options: argparse.Namespace) -> Iterator[tuple[str, Sequence]]:
+    for world, seed in product(WORLDS, range(options.seeds)):
+        yield f"{world} {seed}", SimulatedSequence(world, duration_s=20.0, seed=seed, imu=ImuModel())
+    for path in options.recording:
+        yield path.name, open_sequence(path)
+
+
 WORLDS_OF_SET_UPS = ("street", "city", "field")
 
 
@@ -255,6 +311,7 @@ SECTIONS: dict[str, Callable[[argparse.Namespace], list[Row]]] = {
     "outages": outages,
     "scenes": scenes,
     "set-ups": set_ups,
+    "verdicts": verdicts,
 }
 
 
@@ -269,13 +326,15 @@ def main() -> None:
     )
     parser.add_argument("--seeds", type=int, default=2, help="of starts: roads of each kind")
     parser.add_argument("--scans", type=int, default=12, help="of starts and drive: number of scans")
-    parser.add_argument("--recording", type=Path, help="of drive: a recording with truth")
+    parser.add_argument(
+        "--recording", type=Path, nargs="+", default=[], help="of drive and verdicts: recordings with truth"
+    )
     parser.add_argument("--starts", type=int, nargs="+", default=[0], help="of drive: first scans")
     parser.add_argument("--lidar-only", action="store_true", help="leave the inertial samples out")
     parser.add_argument("--json", action="store_true", help="one JSON object on the last line")
     options = parser.parse_args()
-    if options.section == "drive" and options.recording is None:
-        parser.error("drive: give --recording.")
+    if options.section == "drive" and len(options.recording) != 1:
+        parser.error("drive: give one --recording.")
     if options.section == "set-ups" and set(options.recipes) & set(PEERS):
         parser.error("set-ups: peers name no faults; give --recipes without them.")
     prepare_jax()
