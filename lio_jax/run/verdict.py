@@ -18,8 +18,11 @@ TOLERATED_M, TOLERATED_SHARE = 1.0, 0.05
 _CONTRADICTED_M = 0.3
 """Error of the motion against the plan view that counts, m; of a long way the tolerated share counts, up to
 the tolerated distance. Where a plan view is certain it is right to 0.2 m."""
+_SHOWN_NOISES = 3.0
+"""Error against the plan view that counts, over the median of those before: among bushes and few poles a view
+is right to 0.15 m only."""
 _WINDOW = 20
-"""Number of scans over which convergence and the normalised innovation are averaged."""
+"""Number of scans over which convergence and the normalised innovation are averaged, and of plan views."""
 _UNCONVERGED = 0.5
 """Share of the window's scans that may end without convergence."""
 _LARGEST_NIS = 25.0
@@ -32,7 +35,11 @@ or is carried reaches them, a match that jumps does."""
 _ROUGH_SCANS = 10
 _UNOBSERVED_M = 20.0
 """Way with an unobserved direction of motion that is tolerated where no inertial samples bridge it, m."""
-
+_UNOBSERVED_S = 5.0
+"""Time with an unobserved direction that inertial samples bridge, s: an attitude that is 0.5 deg off moves
+the position by 1 m in it."""
+_SIGMAS = 4.0
+"""Such a time counts where so many standard deviations of the position exceed the tolerated error."""
 _HIDDEN_LOOKS = 2
 """Number of successive plan views without a certain motion from which it counts as hidden."""
 
@@ -43,6 +50,8 @@ class _Evidence:
 
     way: float = 0.0
     unmatched_since_s: float | None = None
+    observed_s: float = 0.0
+    """Time of the last scan that showed all directions, s."""
     unobserved_m: float = 0.0
     contradictions: int = 0
     hidden_m: float = 0.0
@@ -50,6 +59,7 @@ class _Evidence:
     hidden_looks: int = 0
     shown_step: float = 0.0
     last: tuple[NDArray[np.float64], float] | None = None
+    shown_errors: deque[float] = field(default_factory=lambda: deque(maxlen=_WINDOW))
     accelerations: deque[float] = field(default_factory=lambda: deque(maxlen=_ROUGH_SCANS))
     unconverged: deque[bool] = field(default_factory=lambda: deque(maxlen=_WINDOW))
     nis: deque[float] = field(default_factory=lambda: deque(maxlen=_WINDOW))
@@ -139,7 +149,11 @@ class Verdict(Sink):
         shown = result.shown_motion
         if shown is None:
             return
-        if shown.error > min(max(_CONTRADICTED_M, TOLERATED_SHARE * shown.way), TOLERATED_M):
+        errors = self._seen.shown_errors
+        noise = float(np.median(errors)) if errors else 0.0
+        least = max(_CONTRADICTED_M, TOLERATED_SHARE * shown.way, _SHOWN_NOISES * noise)
+        errors.append(shown.error)
+        if shown.error > min(least, TOLERATED_M):
             self._seen.contradictions += shown.error > TOLERATED_M
             self._doubt(
                 "motion",
@@ -170,15 +184,24 @@ class Verdict(Sink):
             self._doubt("restart", f"at {self._now_s:.1f} s velocity or biases ran away and began anew")
 
     def _note_unobserved(self, result: ScanResult, step: float) -> None:
-        output = result.output
-        bridged = output.covariance is not None
+        output, seen = result.output, self._seen
         weak = bool(np.any(output.registration.degenerate)) and not bool(output.lost)
-        self._seen.unobserved_m = self._seen.unobserved_m + step if weak and not bridged else 0.0
-        if self._seen.unobserved_m > max(_UNOBSERVED_M, TOLERATED_SHARE * self._seen.way):
+        if not weak and not bool(output.lost):
+            seen.observed_s, seen.unobserved_m = self._now_s, 0.0
+        seen.unobserved_m += step * weak
+        sigma = _sigma(output.covariance)
+        if sigma is None and seen.unobserved_m > max(_UNOBSERVED_M, TOLERATED_SHARE * seen.way):
             self._doubt(
                 "unobserved",
                 f"up to {self._now_s:.1f} s the scene left a direction unobserved over "
-                f"{self._seen.unobserved_m:.0f} m",
+                f"{seen.unobserved_m:.0f} m",
+            )
+        since_s = self._now_s - seen.observed_s
+        if weak and sigma is not None and since_s > _UNOBSERVED_S and _SIGMAS * sigma > TOLERATED_M:
+            self._doubt(
+                "unobserved",
+                f"up to {self._now_s:.1f} s no scan showed one direction of the motion for {since_s:.1f} s, "
+                f"and the position's standard deviation is {sigma:.1f} m",
             )
 
     def _note_hidden(self, result: ScanResult, step: float) -> None:

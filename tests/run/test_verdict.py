@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ from lio_jax.run.scan_inputs import padded
 from lio_jax.run.shown_motion import MotionCheck, ShownMotion
 from lio_jax.run.verdict import Verdict, in_words
 from lio_jax.settings.settings import recipe_settings
+from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
 from tests.run.roads import relative, road, steps, tracked
 from tests.run.test_first_velocity import DRIVE
@@ -130,6 +132,51 @@ def test_what_stays_behind_in_a_tunnel_is_noticed():
     found = verdict_of(settings, results)
     assert found["state"] != "sound"
     assert found["since_s"] <= 0.1 * np.argmax(error > 1)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "sigma", "is_doubted"), [(6.0, 0.3, True), (4.0, 0.3, False), (6.0, 0.1, False)]
+)
+def test_a_direction_that_only_inertial_samples_show_is_doubtful_after_five_seconds(
+    seconds, sigma, is_doubted
+):
+    settings, results = tracked(road("street", 5.0, 0.0, 8), "default")
+    output = results[-1].output
+    blind = replace(
+        output,
+        registration=replace(output.registration, degenerate=jnp.arange(6) == 0),
+        covariance=jnp.diag(jnp.array([1e-6] * 3 + [sigma**2] * 3 + [1e-6] * 18)),
+    )
+    onwards = [
+        replace(moved(results[-1], number, 0.5 * number), output=blind)
+        for number in range(1, round(10 * seconds))
+    ]
+    found = verdict_of(settings, [*results, *onwards])
+    assert any("no scan showed one direction" in reason for reason in found["reasons"]) == is_doubted
+    assert (found["state"] != "sound") == is_doubted
+
+
+def test_a_drone_over_a_field_warns_before_it_is_a_metre_off():
+    sequence = SimulatedSequence("field", duration_s=11.0, seed=1, imu=ImuModel())
+    settings, results = tracked(sequence, "lio_sam")
+    poses, truth = relative(results, sequence)
+    error = np.linalg.norm((poses - truth)[:, :3, 3], axis=1)
+    assert error[-1] > 0.8
+    found = verdict_of(settings, results)
+    assert found["state"] != "sound"
+    assert found["since_s"] <= 0.1 * (np.argmax(error > 1) or len(error))
+
+
+@pytest.mark.parametrize(("error", "state"), [(0.4, "sound"), (0.6, "doubtful")])
+def test_a_view_that_is_never_precise_has_to_differ_more(error, state):
+    settings, results = tracked(road("street", 5.0, 0.0, 8), "default")
+    clear = [replace(one, shown_motion=None) for one in results]
+    errors = [0.15] * 5 + [error]
+    seen = [
+        replace(moved(clear[-1], number, 0.5 * number), shown_motion=ShownMotion(off, 2.5, 0.0, 5))
+        for number, off in enumerate(errors, 1)
+    ]
+    assert verdict_of(settings, [*clear, *seen])["state"] == state
 
 
 def test_plan_views_are_compared_at_any_speed():
