@@ -82,23 +82,24 @@ def plan_view(points: NDArray[np.float32]) -> PlanView:
     Args:
         points: (m, 3) m, in level axes about the sensor; finite.
     """
-    horizontal = np.hypot(points[:, 0], points[:, 1])
-    points = points[(horizontal > _NEAREST) & (horizontal < _FARTHEST)]
+    x, y, height = np.ascontiguousarray(points.T)
+    squared = x * x + y * y
+    in_range = np.flatnonzero((squared > _NEAREST**2) & (squared < _FARTHEST**2))
+    x, y, height = x[in_range], y[in_range], height[in_range]
     width = _width(CELL)
     occupied = np.zeros((width, width), np.bool_)
-    if not len(points):
-        return PlanView(occupied, points[:, :2], points[:, :2])
-    cell = _cell_of(points[:, :2], CELL)
-    order = np.argsort(cell, kind="stable")
-    cell, points = cell[order], points[order]
-    first = np.flatnonzero(np.diff(cell, prepend=-1))
-    lowest = np.minimum.reduceat(points[:, 2], first)
-    count = np.diff(first, append=len(points))
-    centers = np.add.reduceat(points[:, :2], first) / count[:, None]
-    upright = np.maximum.reduceat(points[:, 2], first) - lowest > _UPRIGHT
-    occupied.ravel()[cell[first][upright]] = True
-    stands = np.repeat(upright, count) & (points[:, 2] > np.repeat(lowest + _ABOVE_GROUND, count))
-    return PlanView(occupied, centers[upright].astype(np.float32), points[stands, :2])
+    row, column = _index_of(x, CELL), _index_of(y, CELL)
+    cell = row * width + column
+    lowest, highest = np.full(width**2, np.inf, np.float32), np.full(width**2, -np.inf, np.float32)
+    np.minimum.at(lowest, cell, height)
+    np.maximum.at(highest, cell, height)
+    upright = highest - lowest > _UPRIGHT
+    (found,) = np.nonzero(upright)
+    occupied.ravel()[found] = True
+    count, *sums = (np.bincount(cell, weights, width**2)[found] for weights in (None, x, y))
+    centers = (np.stack(sums, axis=-1) / count[:, None]).astype(np.float32)
+    stands = np.flatnonzero(upright[cell] & (height > lowest[cell] + _ABOVE_GROUND))
+    return PlanView(occupied, centers, np.stack([x[stands], y[stands]], axis=-1))
 
 
 def displacement(
@@ -113,7 +114,7 @@ def displacement(
         step: distance between two displacements that are tried, m.
     """
     tried = _disc(min(reach, _LONGEST), step)
-    votes = _hits(first.occupied, CELL, centers, tried).sum(axis=1)
+    votes = np.count_nonzero(_hits(first.occupied, CELL, centers, tried), axis=1)
     best = int(np.argmax(votes))
     apart = np.linalg.norm(tried - tried[best], axis=1)
     peak = (apart <= _PEAK) & (votes >= 0.9 * votes[best])
@@ -138,10 +139,10 @@ def refined(first: PlanView, points: NDArray[np.float32], shift: NDArray[np.floa
     """
     width = _width(_FINE_CELL)
     occupied = np.zeros((width, width), np.bool_)
-    occupied.ravel()[_cell_of(first.points, _FINE_CELL)] = True
+    occupied[tuple(_index_of(first.points.T, _FINE_CELL))] = True
     tried = shift + _disc(_FINE_REACH, _FINE_STEP)
     some = points[:: max(1, len(points) // _REFINED_POINTS)]
-    votes = _hits(occupied, _FINE_CELL, some, tried).sum(axis=1)
+    votes = np.count_nonzero(_hits(occupied, _FINE_CELL, some, tried), axis=1)
     weights = np.maximum(votes - 0.8 * votes.max(), 0)
     found: NDArray[np.float64] = np.average(tried, axis=0, weights=weights) if weights.any() else shift
     return found
@@ -159,8 +160,13 @@ def _hits(
     occupied: NDArray[np.bool_], cell: float, positions: NDArray[np.float32], tried: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Return (n, k) which of (k, 2) positions each of (n, 2) displacements moves into occupied cells."""
-    moved = positions + tried[:, None].astype(np.float32)
-    hits: NDArray[np.bool_] = occupied.ravel()[_cell_of(moved, cell)]
+    numbers = []
+    for axis, stride in ((0, len(occupied)), (1, 1)):
+        # the displacements lie on a grid: an axis has few different ones
+        different, which = np.unique(tried[:, axis], return_inverse=True)
+        index = _index_of(positions[:, axis] + different[:, None].astype(np.float32), cell)
+        numbers.append((index * stride)[which])
+    hits: NDArray[np.bool_] = occupied.ravel()[numbers[0] + numbers[1]]
     return hits
 
 
@@ -172,8 +178,6 @@ def _width(cell: float) -> int:
     return int(2 * (_FARTHEST + _LONGEST + _FINE_REACH) / cell) + 2
 
 
-def _cell_of(positions: NDArray[np.float32], cell: float) -> NDArray[np.int32]:
-    """Return the number of the cell of each (..., 2) position."""
-    width = _width(cell)
-    index = np.floor(positions / np.float32(cell)).astype(np.int32) + width // 2
-    return index[..., 0] * width + index[..., 1]
+def _index_of(positions: NDArray[np.float32], cell: float) -> NDArray[np.int32]:
+    """Return the row or the column of the cell of each coordinate, m."""
+    return np.floor(positions * np.float32(1 / cell)).astype(np.int32) + _width(cell) // 2

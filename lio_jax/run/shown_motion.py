@@ -80,9 +80,13 @@ def first_velocity(
     return velocity if np.linalg.norm(velocity) > _SLOWEST else None
 
 
-def _points(scan: Scan) -> NDArray[np.float32]:
-    points = np.asarray(scan.points, np.float32)[np.asarray(scan.mask)]
-    return points[np.isfinite(points).all(axis=1)]
+def _points(scan: Scan, most: int | None = None) -> NDArray[np.float32]:
+    """Return the finite points, (n, 3) m, evenly thinned to at most ``most``."""
+    real = np.flatnonzero(scan.mask)
+    every = 1 if most is None else max(1, -(-len(real) // most))
+    points = np.asarray(scan.points, np.float32)[real[::every]]
+    finite = np.isfinite(points)
+    return points if finite.all() else points[finite.all(axis=1)]
 
 
 def _levelled(
@@ -164,7 +168,7 @@ _UNSUSPICIOUS = 0.2
 _STEP = 0.5
 """Distance between two errors that are tried, m."""
 _POINTS = 40_000
-"""A scan with more points is thinned to about so many."""
+"""A scan with more points is thinned to at most so many."""
 
 
 @dataclass(frozen=True)
@@ -260,9 +264,7 @@ class MotionCheck:
 
 
 def _view(scan: Scan, T_world_lidar: NDArray[np.float64]) -> PlanView:
-    points = _points(scan)
-    level = Rotation.from_matrix(T_world_lidar[:3, :3])
-    return plan_view(_turned(points[:: max(1, len(points) // _POINTS)], level))
+    return plan_view(_turned(_points(scan, _POINTS), Rotation.from_matrix(T_world_lidar[:3, :3])))
 
 
 def _compared_with(
