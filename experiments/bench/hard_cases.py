@@ -30,6 +30,7 @@ from hard_runs import PEERS, judged, moves, relative
 from roads import driven_along, road_scene
 
 from lio_jax.commands.runtime import prepare_jax
+from lio_jax.core.errors import UsageError
 from lio_jax.data.detect import open_sequence
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.sim.imu import ImuModel
@@ -218,7 +219,11 @@ def verdicts(options: argparse.Namespace) -> list[Row]:
     for name, sequence in _drives(options):
         scans = list(sequence.scans())
         for recipe in options.recipes:
-            run = judged(sequence, scans, recipe, options.lidar_only)
+            try:
+                run = judged(sequence, scans, recipe, options.lidar_only)
+            except UsageError:
+                print(f"| {recipe} | {name} | needs inertial samples | | | | |", flush=True)
+                continue
             estimated, true = relative(run.results, sequence)
             stamps = np.array([one.stamp_ns for one in run.results])
             known = np.isin(stamps, sequence.truth().at(stamps).stamp_ns)  # type: ignore[union-attr]

@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass, field
+from statistics import fmean, median
 from typing import Any
 
 import numpy as np
@@ -86,10 +87,11 @@ class Verdict(Sink):
         if self._before is not None:
             step = float(np.linalg.norm(result.T_world_imu[:3, 3] - self._before.T_world_imu[:3, 3]))
         self._seen.way += step
-        self._note_outage(result)
+        sigma = _sigma(result.output.covariance)
+        self._note_outage(result, sigma)
         self._note_motion(result)
-        self._note_window(result)
-        self._note_unobserved(result, step)
+        self._note_window(result, sigma)
+        self._note_unobserved(result, step, sigma)
         self._note_hidden(result, step)
         self._note_jumps(result)
         self._before = result
@@ -123,14 +125,13 @@ class Verdict(Sink):
     def _doubt(self, kind: str, words: str, since_s: float | None = None) -> None:
         self._reasons.setdefault(kind, (self._now_s if since_s is None else since_s, words))
 
-    def _note_outage(self, result: ScanResult) -> None:
+    def _note_outage(self, result: ScanResult, sigma: float | None) -> None:
         output, before = result.output, self._before
         lost = bool(output.lost)
         unmatched = self._seen.unmatched_since_s
         if lost and unmatched is None and before is not None:
             unmatched = (before.stamp_ns - (self._first_ns or 0)) * 1e-9
         if (outage := result.outage) is not None:
-            sigma = _sigma(output.covariance)
             error = outage.position if sigma is None else sigma
             if error > TOLERATED_M or error > TOLERATED_SHARE * self._seen.way:
                 known = (
@@ -150,7 +151,7 @@ class Verdict(Sink):
         if shown is None:
             return
         errors = self._seen.shown_errors
-        noise = float(np.median(errors)) if errors else 0.0
+        noise = median(errors) if errors else 0.0
         least = max(_CONTRADICTED_M, TOLERATED_SHARE * shown.way, _SHOWN_NOISES * noise)
         errors.append(shown.error)
         if shown.error > min(least, TOLERATED_M):
@@ -161,35 +162,35 @@ class Verdict(Sink):
                 f"{shown.error:.1f} m: the scan match follows the scan lines, or the map is wrong",
             )
 
-    def _note_window(self, result: ScanResult) -> None:
+    def _note_window(self, result: ScanResult, sigma: float | None) -> None:
         output, seen = result.output, self._seen
-        seen.unconverged.append(int(output.registration.status) == ITERATION_LIMIT)
-        if len(seen.unconverged) == _WINDOW and np.mean(seen.unconverged) > _UNCONVERGED:
+        status = int(output.registration.status)
+        seen.unconverged.append(status == ITERATION_LIMIT)
+        if len(seen.unconverged) == _WINDOW and fmean(seen.unconverged) > _UNCONVERGED:
             self._doubt(
                 "convergence", f"more than half of the scans around {self._now_s:.1f} s did not converge"
             )
         freedom = int(output.nis_dof)
-        if freedom and int(output.registration.status) == CONVERGED:
+        if freedom and status == CONVERGED:
             seen.nis.append(float(output.nis) / freedom)
-        if len(seen.nis) == _WINDOW and (mean := float(np.mean(seen.nis))) > _LARGEST_NIS:
+        if len(seen.nis) == _WINDOW and (mean := fmean(seen.nis)) > _LARGEST_NIS:
             self._doubt(
                 "innovation",
                 f"around {self._now_s:.1f} s the scans contradict the prediction by inertial samples "
                 f"(normalised innovation {mean:.0f} times what is expected)",
             )
-        sigma = _sigma(output.covariance)
         if sigma is not None and sigma > max(TOLERATED_M, TOLERATED_SHARE * seen.way):
             self._doubt("covariance", f"the position's standard deviation reached {sigma:.1f} m")
         if _is_true(output.restarted):
             self._doubt("restart", f"at {self._now_s:.1f} s velocity or biases ran away and began anew")
 
-    def _note_unobserved(self, result: ScanResult, step: float) -> None:
+    def _note_unobserved(self, result: ScanResult, step: float, sigma: float | None) -> None:
         output, seen = result.output, self._seen
-        weak = bool(np.any(output.registration.degenerate)) and not bool(output.lost)
-        if not weak and not bool(output.lost):
+        lost = bool(output.lost)
+        weak = bool(np.asarray(output.registration.degenerate).any()) and not lost
+        if not weak and not lost:
             seen.observed_s, seen.unobserved_m = self._now_s, 0.0
         seen.unobserved_m += step * weak
-        sigma = _sigma(output.covariance)
         if sigma is None and seen.unobserved_m > max(_UNOBSERVED_M, TOLERATED_SHARE * seen.way):
             self._doubt(
                 "unobserved",
@@ -242,7 +243,7 @@ class Verdict(Sink):
         evenly = np.linalg.norm(step - last[0]) / (interval * last[1])
         seen.accelerations.append(float(min(by_stamps, evenly)))
         full = len(seen.accelerations) == _ROUGH_SCANS
-        rough = float(np.median(seen.accelerations)) if full else 0.0
+        rough = median(seen.accelerations) if full else 0.0
         if seen.accelerations[-1] > _STRONGEST or rough > _ROUGHEST:
             self._doubt(
                 "jumps",
