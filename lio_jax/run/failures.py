@@ -179,14 +179,14 @@ _LARGEST = 3.0
 
 
 @dataclass(frozen=True)
-class Outage:
+class BridgedOutage:
     """The time without a match before a new piece of map, and the possible error of that piece's pose."""
 
     duration: float
     """Time since the last scan that was matched, s."""
     covariance: NDArray[np.float64] | None
     """(6, 6) covariance of the pose's right perturbation, rotation (rad) before translation (m); None where
-    the recipe has none."""
+    the recipe has none, or none that is finite."""
     position: float
     """Largest error of the position, m."""
     heading: float
@@ -200,7 +200,7 @@ class OutageWatch:
         self._matched_ns: int | None = None
         self._speed = 0.0
 
-    def __call__(self, stamp_ns: int, now: ScanEvidence, covariance: Any) -> Outage | None:
+    def __call__(self, stamp_ns: int, now: ScanEvidence, covariance: Any) -> BridgedOutage | None:
         """Return the outage that ends with a scan; None for all other scans.
 
         Args:
@@ -224,12 +224,12 @@ def largest_sigma(covariance: NDArray[np.float64]) -> float:
     return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0))) if known else np.inf
 
 
-def _outage(duration: float, speed: float, covariance: Any) -> Outage:
-    if covariance is None:
-        return Outage(duration, None, speed * duration + _SPEEDS_UP / 2 * duration**2, np.pi)
+def _outage(duration: float, speed: float, covariance: Any) -> BridgedOutage:
+    if covariance is None or not np.isfinite(covariance).all():
+        return BridgedOutage(duration, None, speed * duration + _SPEEDS_UP / 2 * duration**2, np.pi)
     pose = np.array(covariance, np.float64)[:6, :6]
     position, rotation = (_LARGEST * largest_sigma(block) for block in (pose[3:, 3:], pose[:3, :3]))
-    return Outage(duration, pose, position, min(rotation, np.pi))
+    return BridgedOutage(duration, pose, position, min(rotation, np.pi))
 
 
 def _match_failure(now: ScanEvidence, settings: Settings) -> str:

@@ -211,7 +211,7 @@ class GlobalCorrection(Sink):
                 for verdict, weight in found.loops
                 if weight is not None and weight > 0.5
             )
-            by = [f"{loops} loops"] * (loops > 0) + ["the GPS fixes"] * (found.T_enu_world is not None)
+            by = [f"loops ({loops})"] * (loops > 0) + ["GPS fixes"] * (found.T_enu_world is not None)
             tie = f"{' and '.join(by)} tie" if by else "nothing ties"
             end = "" if by else "; its place there is predicted"
             sentences.append(f"a new piece of map begins at {at_s:.1f} s: {tie} it to the map before{end}.")

@@ -15,7 +15,7 @@ from lio_jax.core.files import atomic_path, read_arrays
 from lio_jax.core.geometry import carried
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.pose_graph.g2o import G2oEdge
-from lio_jax.run.failures import Outage
+from lio_jax.run.failures import BridgedOutage
 from lio_jax.run.track import ScanResult
 from lio_jax.settings.settings import Settings
 
@@ -66,9 +66,9 @@ class KeyframePicker:
         return self._last
 
 
-def _across(outage: Outage) -> NDArray[np.float64]:
+def _across(outage: BridgedOutage) -> NDArray[np.float64]:
     """Return the covariance of the pose across an outage, (6, 6)."""
-    if outage.covariance is not None and np.isfinite(outage.covariance).all():
+    if outage.covariance is not None:
         return outage.covariance + _LOOSE
     return np.diag([outage.heading**2] * 3 + [outage.position**2] * 3)
 

@@ -15,7 +15,7 @@ from lio_jax.core.xla import programs
 from lio_jax.data.sequence import LidarScan
 from lio_jax.recipes.params import RecipeParams as Params
 from lio_jax.recipes.transforms import RecipeLike, Stepper, reopened, with_first_velocity
-from lio_jax.run.failures import Outage, OutageWatch, ScanEvidence, failure_of, longest_gap
+from lio_jax.run.failures import BridgedOutage, OutageWatch, ScanEvidence, failure_of, longest_gap
 from lio_jax.run.scan_inputs import ImuFeed, bucket_for, padded
 from lio_jax.run.shown_motion import MotionCheck, ShownMotion, first_velocity
 from lio_jax.settings.settings import Settings, recipe_of
@@ -50,7 +50,7 @@ class ScanResult:
     """What plan views show of the motion since an earlier scan; None where it was not compared."""
     motion_is_hidden: bool | None = None
     """Whether that comparison shows no motion without doubt; None where nothing was compared."""
-    outage: Outage | None = None
+    outage: BridgedOutage | None = None
     """The outage after which a new piece of map begins with this scan."""
     raw: NDArray[np.float32] | None = None
     """(k, 3) some of the points as recorded, m in the lidar frame of their own firing, for pictures."""
