@@ -66,7 +66,7 @@ def test_a_file_changes_values_of_the_recipe_it_names():
 
 def test_the_command_line_starts_from_the_recipes_values():
     settings = resolve_settings("fast_lio2", ("params.knn.radius=1.5",))
-    assert settings.config.registration.max_iterations == 4
+    assert settings.config.registration.max_iterations == 8
     assert settings.values["knn"]["radius"] == 1.5
 
 

@@ -139,7 +139,7 @@ def test_fast_lio2s_values_for_ros2():
             assert settings.values[section][name] == pytest.approx(value, rel=1e-12), (section, name)
     assert settings.run.data.time_unit == "ns"
     assert settings.config.fast_lio2.point_filter_num == 3
-    assert settings.config.registration.max_iterations == own.config.registration.max_iterations
+    assert settings.config.registration.max_iterations == 4
 
 
 def test_a_density_grows_as_the_root_of_the_covariance():
