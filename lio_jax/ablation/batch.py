@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from lio_jax.data.sequence import Sequence, prefetched
+from lio_jax.data.sequence import Sequence
 from lio_jax.recipes.transforms import batched
 from lio_jax.run.logs import Failures, Overflow, StageTimes, TrajectoryLog
 from lio_jax.run.run import check_start, imu_feed, nothing_read, prediction
@@ -52,12 +52,12 @@ def run_batch(
         [TrajectoryLog(), StageTimes("step", "total"), Failures(start), Overflow(one), Verdict(one)]
         for one in settings
     ]
-    scans: Any = prefetched(sequence.scans(start, count), first.run.data.prefetch)
+    scans = sequence.scans(start, count)
     stepper = Compiled(batched(recipe_of(first)), stacked)
     compiled_s, tracked = stepper.compile_s, False
     for fed, state, output in run_steps(stepper, scan_inputs(first, scans, imu)):
         nav, seen = jax.device_get((state.nav, output))
-        step_s = time.perf_counter() - fed.padded_at - (stepper.compile_s - compiled_s)
+        step_s = time.perf_counter() - fed.begun_at - (stepper.compile_s - compiled_s)
         compiled_s = stepper.compile_s
         tracked = True
         for number, (judged, own_sinks) in enumerate(zip(judges, sinks, strict=True)):

@@ -36,4 +36,4 @@ class DataConfig:
     scan_period: float = static(0.1, "s", above=0)
     """Duration of one sweep where it cannot be read from the data."""
     prefetch: int = static(3, least=0)
-    """Number of scans decoded ahead on a thread."""
+    """Number of scans decoded and padded ahead on a thread."""

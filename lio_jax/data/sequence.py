@@ -3,7 +3,7 @@ thread."""
 
 import queue
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -144,7 +144,7 @@ class _End:
     error: BaseException | None
 
 
-def prefetched(iterator: Iterator[T], depth: int) -> Iterator[T]:
+def prefetched(iterator: Iterator[T], depth: int) -> Generator[T]:
     """Yield the items of ``iterator``; up to ``depth`` of them are produced ahead on a thread.
 
     An exception of the iterator is raised here, at its place. If the consumer stops early (the generator is

@@ -3,7 +3,7 @@
 import resource
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from collections.abc import Sequence as Listing
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.data.detect import without_effect
 from lio_jax.data.imu_checks import cleaned
-from lio_jax.data.sequence import LidarScan, Sequence, prefetched
+from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.imu.params import OrientedImuConfig
 from lio_jax.recipes.params import InertialConfig
 from lio_jax.run.fitted_settings import fitted_to_surroundings, with_point_order, with_sensor_sizes
@@ -100,13 +100,12 @@ def run_sequence(
             stack.callback(sink.close)
             everyone.append(sink)
         everyone += sinks
-        decoded = _timed(sequence.scans(start, count), times.ms["decode"])
-        scans: Any = prefetched(decoded, settings.run.data.prefetch)
+        scans = _timed(sequence.scans(start, count), times.ms["decode"])
         interruption: BaseException | None = None
         try:
             # closing: a sink that raises must not leave the decoding thread and its files behind
-            with closing(scans):
-                _hand_out(track(settings, scans, imu, step), everyone, times.ms["record"])
+            with closing(scans), closing(track(settings, scans, imu, step)) as results:
+                _hand_out(results, everyone, times.ms["record"])
         except (KeyboardInterrupt, Exception) as error:
             interruption = error
         if not len(log):
@@ -216,7 +215,7 @@ def peak_rss_mb() -> float:
     return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)
 
 
-def _timed(scans: Iterator[LidarScan], decode_ms: list[float]) -> Iterator[LidarScan]:
+def _timed(scans: Iterator[LidarScan], decode_ms: list[float]) -> Generator[LidarScan]:
     while True:
         start = time.perf_counter()
         scan = next(scans, None)

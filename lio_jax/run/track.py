@@ -1,7 +1,9 @@
 """Feed scans through a recipe's step, one by one, and bring each result back to the host."""
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.core.xla import programs
-from lio_jax.data.sequence import LidarScan
+from lio_jax.data.sequence import LidarScan, prefetched
 from lio_jax.recipes.params import RecipeParams as Params
 from lio_jax.recipes.transforms import RecipeLike, Stepper, reopened, with_first_velocity
 from lio_jax.run.failures import BridgedOutage, OutageWatch, ScanEvidence, failure_of, longest_gap
@@ -112,8 +114,11 @@ def track(
     scans: Iterable[LidarScan],
     imu: ImuFeed | None = None,
     step: CompiledStep | None = None,
-) -> Iterator[ScanResult]:
-    """Yield the result of each scan in turn.
+) -> Generator[ScanResult]:
+    """Yield the result of each scan in turn, each while the step of the next scan runs.
+
+    What the host does with a result, here and where it is taken, thus costs no time of its own unless it
+    takes longer than a step. After an error or Ctrl-C the result that was kept back is yielded first.
 
     Args:
         settings: recipe, config and params.
@@ -124,11 +129,31 @@ def track(
     step = step or CompiledStep(settings)
     judged = ResultBuilder(settings)
     compiled_s = step.compile_s
-    for fed, state, output in run_steps(step, scan_inputs(settings, scans, imu)):
-        nav, result = jax.tree.map(np.array, (state.nav, output.registration))
-        step_ms = (time.perf_counter() - fed.padded_at - (step.compile_s - compiled_s)) * 1e3
-        compiled_s = step.compile_s
-        yield judged(fed, nav, result, output, step_ms)
+    held: tuple[Any, ...] | None = None
+    # closing: whoever stops early must not leave the decoding thread and its files behind
+    with ThreadPoolExecutor(1) as reader, closing(scan_inputs(settings, scans, imu)) as inputs:
+        try:
+            for fed, state, output in run_steps(step, inputs):
+                reading = reader.submit(_on_host, state.nav, output.registration)
+                compiled_in_step_s, compiled_s = step.compile_s - compiled_s, step.compile_s
+                if held is not None:
+                    last, held = held, None
+                    yield judged(*last)
+                nav, registration, read_at = reading.result()
+                step_ms = (read_at - fed.begun_at - compiled_in_step_s) * 1e3
+                held = fed, nav, registration, output, step_ms
+        except (KeyboardInterrupt, Exception):
+            if held is not None:
+                yield judged(*held)
+            raise
+        if held is not None:
+            yield judged(*held)
+
+
+def _on_host(nav: Any, registration: Any) -> tuple[Any, Any, float]:
+    """Return copies with numpy leaves, and the host time when they were there, s."""
+    nav, registration = jax.tree.map(np.array, (nav, registration))
+    return nav, registration, time.perf_counter()
 
 
 class ResultBuilder:
@@ -201,12 +226,22 @@ class ScanInput:
     """(3,) velocity at the first scan's end that this second scan shows, m/s along the IMU's axes; None for
     the other scans, and where the vehicle is slow or ``params.initial.velocity`` is not zero."""
     pad_ms: float
-    padded_at: float
-    """Host time, s."""
+    begun_at: float = 0.0
+    """Host time at which its step began, s."""
 
 
-def scan_inputs(settings: Settings, scans: Iterable[LidarScan], imu: ImuFeed | None) -> Iterator[ScanInput]:
-    """Yield each scan in padded arrays, with the inertial samples that cover it."""
+def scan_inputs(settings: Settings, scans: Iterable[LidarScan], imu: ImuFeed | None) -> Generator[ScanInput]:
+    """Yield each scan in padded arrays, with the inertial samples that cover it.
+
+    ``config.data.prefetch`` of them are decoded and padded ahead on a thread, which ends when the generator
+    is closed.
+    """
+    return prefetched(_padded_in_turn(settings, scans, imu), settings.run.data.prefetch)
+
+
+def _padded_in_turn(
+    settings: Settings, scans: Iterable[LidarScan], imu: ImuFeed | None
+) -> Generator[ScanInput]:
     last_end_ns, last_count, size = None, 0, 0
     first: ScanInput | None = None
     opened = False
@@ -230,7 +265,7 @@ def scan_inputs(settings: Settings, scans: Iterable[LidarScan], imu: ImuFeed | N
         if first is not None and not opened and usable and to_search:
             interval = (scan.end_ns - first.end_ns) * 1e-9
             velocity = first_velocity(first.scan, arrays, interval, first.before, samples, R_imu_lidar)
-        done = time.perf_counter()
+        pad_ms = (time.perf_counter() - start) * 1e3
         fed = ScanInput(
             index,
             scan.end_ns,
@@ -241,8 +276,7 @@ def scan_inputs(settings: Settings, scans: Iterable[LidarScan], imu: ImuFeed | N
             samples,
             before,
             velocity,
-            (done - start) * 1e3,
-            done,
+            pad_ms,
         )
         opened = first is not None
         first = first or (fed if usable else None)
@@ -279,10 +313,10 @@ def run_steps(stepper: Stepper, scan_inputs: Iterable[ScanInput]) -> Iterator[tu
                 first, state, output = held
                 held = None
                 if fed.usable:
-                    first = replace(first, padded_at=time.perf_counter())
+                    first = replace(first, begun_at=time.perf_counter())
                     state, output = reopened(stepper, state, output, first, fed)
                 yield first, state, output
-                fed = replace(fed, padded_at=time.perf_counter())
+            fed = replace(fed, begun_at=time.perf_counter())
             begins = fed.usable and not opened
             if state is None or begins:
                 state = stepper.init(fed.before)
