@@ -16,8 +16,8 @@ from lio_jax.core.errors import UsageError
 from lio_jax.core.files import atomic_path
 from lio_jax.data.detect import open_sequence
 from lio_jax.run.run import settings_for
-from lio_jax.settings.settings import Settings
-from lio_jax.tuning.gradient import Loss
+from lio_jax.settings.settings import Settings, recipe_of
+from lio_jax.tuning.gradient import Loss, wants_map
 from lio_jax.tuning.objective_names import LIKELIHOODS, SHORT
 from lio_jax.tuning.objectives import Named, objective_named
 from lio_jax.tuning.optimise import Bounds
@@ -78,10 +78,17 @@ def tune(
     _, validation = _recordings(validate, settings, None, named, replace(options, start=0, scans=None), None)
     free = free_parameters(settings.params(), patterns)
     _prepare(out, options.overwrite)
+    wanted = wants_map(named, free)
+    through_map = wanted and recipe_of(settings).map_varies
+    if wanted and not through_map:
+        say(
+            f"note: {settings.recipe} takes its map as a constant of the derivative, which is wrong "
+            "for trajectory errors, the objective map and extrinsics; the recipe default does not."
+        )
     session = Session(
         out,
         free,
-        Loss(settings.recipe, settings.config, free, named.objective),
+        Loss(settings.recipe, settings.config, free, named.objective, through_map),
         training,
         validation,
         named.likelihood,

@@ -5,14 +5,18 @@ precise at any distance from the world's origin. Points are given in an *anchore
 a whole number of voxels, such that the vehicle is near the origin.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Int32, UInt32
+from jax.typing import DTypeLike
+from jaxtyping import Array, Bool, Float, Int32, UInt32
 
 from lio_jax.core.geometry import eigenvalues_and_normal3
 from lio_jax.core.hashing import voxel_hash
+from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.prefix_sum import running_count
 from lio_jax.core.xla import computed_once
 
@@ -34,15 +38,20 @@ class VoxelMap(eqx.Module):
 
     voxel: Int32[Array, "c 3"]
     """Integer coordinates of the voxel in each slot; ``FREE`` in a free slot."""
-    moments: Float32[Array, "c 10"]
+    moments: Float[Array, "c 10"]
     """Number of points; sums of x, y and z (m); sums of xx, yy, zz, xy, xz and yz (m^2); coordinates are
     relative to the voxel's centre."""
     cells: UInt32[Array, "c 2"]
     """Bit set of the cells that hold a point."""
-    centroid: Float32[Array, "c 4"]
+    centroid: Float[Array, "c 4"]
     """Mean of the points relative to the voxel's centre, m, and their number. A look-up compares these."""
-    plane: Float32[Array, "c 5"]
+    plane: Float[Array, "c 5"]
     """Unit normal, and the two smaller variances, ascending, m^2. A match uses these."""
+
+    def varying(self) -> "VoxelMap":
+        """Return a tree of booleans: the moments have a derivative, and what follows from them needs none."""
+        fixed = jax.tree.map(lambda _: False, self)
+        return eqx.tree_at(lambda one: one.moments, fixed, True)
 
 
 class Insertion(eqx.Module):
@@ -57,30 +66,33 @@ class Insertion(eqx.Module):
 class VoxelPlanes(eqx.Module):
     """The plane and the distribution of the map's points around each of k queries."""
 
-    mean: Float32[Array, "k 3"]
+    mean: Float[Array, "k 3"]
     """Mean of the points, m, in the anchored frame."""
-    normal: Float32[Array, "k 3"]
+    normal: Float[Array, "k 3"]
     """Direction of the smallest variance, of unit length, in world axes."""
-    variances: Float32[Array, "k 2"]
+    variances: Float[Array, "k 2"]
     """The two smaller variances, ascending, m^2."""
-    count: Float32[Array, " k"]
+    count: Float[Array, " k"]
     """Number of points of the distribution."""
+    slot: Int32[Array, " k"]
+    """Where the table holds the points; 0 where it does not."""
     valid: Bool[Array, " k"]
     """False where no voxel around the query holds enough points."""
 
 
-def empty_map(capacity: int) -> VoxelMap:
+def empty_map(capacity: int, dtype: DTypeLike = jnp.float32) -> VoxelMap:
     """Return a map of free slots.
 
     Args:
         capacity: number of slots, a power of two.
+        dtype: of what the map knows of its points.
     """
     return VoxelMap(
         voxel=jnp.full((capacity, 3), FREE, jnp.int32),
-        moments=jnp.zeros((capacity, 10), jnp.float32),
+        moments=jnp.zeros((capacity, 10), dtype),
         cells=jnp.zeros((capacity, 2), jnp.uint32),
-        centroid=jnp.zeros((capacity, 4), jnp.float32),
-        plane=jnp.zeros((capacity, 5), jnp.float32),
+        centroid=jnp.zeros((capacity, 4), dtype),
+        plane=jnp.zeros((capacity, 5), dtype),
     )
 
 
@@ -102,8 +114,8 @@ def query_nearest(
     vmap: VoxelMap,
     points: Float[Array, "k 3"],
     anchor: Int32[Array, "3"],
-    voxel_size: Float32[Array, ""],
-    min_points: Float32[Array, ""],
+    voxel_size: Float[Array, ""],
+    min_points: Float[Array, ""],
 ) -> VoxelPlanes:
     """Return, for each point, the distribution with the nearest mean among four voxels.
 
@@ -116,7 +128,7 @@ def query_nearest(
         voxel_size: edge length, m.
         min_points: least number of points of a voxel that is used.
     """
-    points = points.astype(jnp.float32)
+    points, voxel_size = points.astype(vmap.moments.dtype), voxel_size.astype(vmap.moments.dtype)
     scaled = points / voxel_size
     own = jnp.floor(scaled)
     side = jnp.where(scaled - own > 0.5, 1, -1).astype(jnp.int32)
@@ -138,6 +150,7 @@ def query_nearest(
         normal=plane[:, :3],
         variances=plane[:, 3:],
         count=_take(vmap.centroid, (found, 3)),
+        slot=found,
         valid=nearest >= 0,
     )
 
@@ -147,8 +160,8 @@ def insert(
     points: Float[Array, "m 3"],
     mask: Bool[Array, " m"],
     anchor: Int32[Array, "3"],
-    voxel_size: Float32[Array, ""],
-    reach: Float32[Array, ""],
+    voxel_size: Float[Array, ""],
+    reach: Float[Array, ""],
 ) -> tuple[VoxelMap, Insertion]:
     """Add points to the distributions of their voxels.
 
@@ -165,8 +178,8 @@ def insert(
         reach: distance from the anchor beyond which voxels may be overwritten, m.
     """
     count = points.shape[0]
-    points = points.astype(jnp.float32)
-    grid = _Grid(anchor, voxel_size, reach)
+    vmap, points = jax.lax.stop_gradient((vmap, points.astype(vmap.moments.dtype)))
+    grid = _Grid(anchor, voxel_size.astype(points.dtype), reach)
     voxel, cell, _ = grid.places(points)
     slot = computed_once(find_slots(vmap, voxel))
     new = mask & ~((slot >= 0) & _held(vmap, slot, cell))
@@ -191,6 +204,90 @@ def insert(
     return vmap, Insertion(added, dropped)
 
 
+def following(
+    vmap: VoxelMap,
+    before: VoxelMap,
+    added: Bool[Array, " m"],
+    points: Float[Array, "m 3"],
+    mask: Bool[Array, " m"],
+    placed_again: Callable[[Int32[Array, " n"]], Float[Array, "n 3"]],
+    anchor: Int32[Array, "3"],
+    voxel_size: Float[Array, ""],
+) -> VoxelMap:
+    """Return the map after an insertion with the derivative of its moments.
+
+    The moments depend on those before and on the points that were added. Which points fill a cell and which
+    voxel gets which slot are choices, which the derivative holds.
+
+    Args:
+        vmap: the map after :func:`insert`.
+        before: the map before; its moments may have a derivative.
+        added: which of the m points filled an empty cell.
+        points: as they were inserted, m, in the anchored frame.
+        mask: which of them were real.
+        placed_again: ``rows -> (n, 3)``: the points of these rows, computed once more for their derivative. A
+            pytree.
+        anchor: voxel whose lower corner is the origin of ``points``.
+        voxel_size: edge length, m.
+    """
+    still = jax.lax.stop_gradient(vmap)
+    choices = jax.lax.stop_gradient((before.voxel, still, added, points, mask, anchor, voxel_size))
+    moments = with_derivative_of(still.moments, _moments_after, before.moments, placed_again, choices)
+    return eqx.tree_at(lambda one: one.moments, still, moments)
+
+
+_CHUNK = 1024
+"""Number of points whose changes are worked out at a time; most scans add few."""
+
+
+def _moments_after(
+    before: Float[Array, "c 10"], placed_again: Callable[[Array], Array], choices: tuple
+) -> Float[Array, "c 10"]:
+    """Return the moments after an insertion whose choices are known."""
+    old, vmap, added, points, mask, anchor, voxel_size = choices
+    capacity, count = len(old), len(added)
+    grid = _Grid(anchor, voxel_size, voxel_size)
+    voxel, _, _ = grid.places(points)
+    slot = find_slots(vmap, voxel)
+    held = jnp.maximum(slot, 0)
+    order = jnp.arange(count, dtype=jnp.int32)
+    fresh = mask & (slot >= 0) & jnp.any(_take(old, held) != voxel, axis=1)
+    # of all points of a fresh voxel one takes away what its slot held before
+    first = jnp.full(capacity, count, jnp.int32).at[jnp.where(fresh, slot, capacity)].min(order, mode="drop")
+    clears = fresh & (_take(first, held) == order)
+    touched = clears | added
+    total = jnp.sum(touched)
+    size = min(_CHUNK, count)
+    padded = -(-count // size) * size
+    place = jnp.where(touched, running_count(touched) - 1, padded)
+    rows = computed_once(jnp.zeros(padded, jnp.int32).at[place].set(order, mode="drop"))
+
+    def changes(some: Array) -> Array:
+        # the module is an argument, because its arrays have a derivative
+        again = with_derivative_of(_take(points, some), lambda place, rows: place(rows), placed_again, some)
+        _, _, offset = grid.places(again)
+        gains = jnp.where(_take(added, some)[:, None], _moment_row(offset), 0.0)
+        loses = jnp.where(_take(clears, some)[:, None], _take(before, _take(held, some)), 0.0)
+        return gains - loses
+
+    def chunk(number: Array) -> Array:
+        some = jax.lax.dynamic_slice(rows, (number * size,), (size,))
+        return jax.lax.cond(
+            number * size < total, changes, lambda rows: jnp.zeros((size, 10), before.dtype), some
+        )
+
+    # a single addition, outside of branches and loops: only then XLA writes into the table where it lies
+    change = jax.lax.map(chunk, jnp.arange(padded // size)).reshape(padded, 10)
+    target = jnp.where(jnp.arange(padded) < total, _take(held, rows), capacity)
+    return before.at[target].add(change, mode="drop")
+
+
+def _moment_row(offset: Float[Array, "m 3"]) -> Float[Array, "m 10"]:
+    """Return what a point adds to the moments of its voxel, given its offset from the voxel's centre, m."""
+    x, y, z = jnp.moveaxis(offset, -1, 0)
+    return jnp.stack([jnp.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z], -1)
+
+
 def find_slots(vmap: VoxelMap, voxel: Int32[Array, "*b 3"]) -> Int32[Array, "*b"]:
     """Return the slot of each voxel; -1 where the map does not hold it.
 
@@ -211,12 +308,12 @@ class _Grid(eqx.Module):
     """The grid of the table, seen from an anchor."""
 
     anchor: Int32[Array, "3"]
-    voxel_size: Float32[Array, ""]
-    reach: Float32[Array, ""]
+    voxel_size: Float[Array, ""]
+    reach: Float[Array, ""]
 
     def places(
-        self, points: Float32[Array, "m 3"]
-    ) -> tuple[Int32[Array, "m 3"], Int32[Array, "m 3"], Float32[Array, "m 3"]]:
+        self, points: Float[Array, "m 3"]
+    ) -> tuple[Int32[Array, "m 3"], Int32[Array, "m 3"], Float[Array, "m 3"]]:
         """Return each point's voxel, its cell in that voxel, and its offset from the voxel's centre, m."""
         scaled = points / self.voxel_size
         local = jnp.floor(scaled)
@@ -226,7 +323,7 @@ class _Grid(eqx.Module):
 
 
 def _insert_new(
-    vmap: VoxelMap, points: Float32[Array, "m 3"], mask: Bool[Array, " m"], grid: _Grid
+    vmap: VoxelMap, points: Float[Array, "m 3"], mask: Bool[Array, " m"], grid: _Grid
 ) -> tuple[VoxelMap, Bool[Array, " m"], Bool[Array, " m"]]:
     """Insert one batch; return the map, which points filled a cell, and which found no slot."""
     capacity = vmap.voxel.shape[0]
@@ -241,13 +338,11 @@ def _insert_new(
 
     fills = _one_per_cell((slot >= 0) & ~_held(vmap, slot, cell), voxel * SUBDIVISION + cell)
     target = computed_once(jnp.where(fills, slot, capacity))
-    x, y, z = jnp.moveaxis(offset, -1, 0)
-    row = jnp.stack([jnp.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z], -1)
-    moments = moments.at[target].add(row, mode="drop")
+    moments = moments.at[target].add(_moment_row(offset), mode="drop")
     word, bit = _word_and_bit(cell)
     cells = cells.at[target, word].add(bit, mode="drop")
 
-    mean, diagonal, off_diagonal = _mean_and_covariance(_take(moments, jnp.maximum(slot, 0)))
+    mean, diagonal, off_diagonal = mean_and_covariance(_take(moments, jnp.maximum(slot, 0)))
     variances, normal = eigenvalues_and_normal3(diagonal, off_diagonal)
     count = _take(moments, (jnp.maximum(slot, 0), 0))
     centroid = jnp.concatenate([mean, count[:, None]], -1)
@@ -311,13 +406,17 @@ def _one_per_cell(wants: Bool[Array, " m"], cell: Int32[Array, "m 3"]) -> Bool[A
 
 
 def _mean(
-    vmap: VoxelMap, slot: Int32[Array, "*b"], local: Int32[Array, "*b 3"], voxel_size: Float32[Array, ""]
-) -> Float32[Array, "*b 3"]:
+    vmap: VoxelMap, slot: Int32[Array, "*b"], local: Int32[Array, "*b 3"], voxel_size: Float[Array, ""]
+) -> Float[Array, "*b 3"]:
     """Return the means, m, in the anchored frame, of slots that hold the voxels ``local`` of that frame."""
-    return (local.astype(jnp.float32) + 0.5) * voxel_size + _take(vmap.centroid, slot)[..., :3]
+    return (local.astype(voxel_size.dtype) + 0.5) * voxel_size + _take(vmap.centroid, slot)[..., :3]
 
 
-def _mean_and_covariance(moments: Float32[Array, "*b 10"]) -> tuple[Array, Array, Array]:
+def mean_and_covariance(moments: Float[Array, "*b 10"]) -> tuple[Array, Array, Array]:
+    """Return the means relative to the voxels' centres (m), and the covariances (m^2).
+
+    Of the covariances, the entries xx, yy and zz come before xy, xz and yz.
+    """
     count = jnp.maximum(moments[..., :1], 1.0)
     mean = moments[..., 1:4] / count
     x, y, z = mean[..., 0], mean[..., 1], mean[..., 2]

@@ -16,7 +16,8 @@ from lio_jax.core.types import ITERATION_LIMIT, ImuBatch, NavState, Scan
 from lio_jax.estimation.map_drift import MapDrift
 from lio_jax.imu.path import Path, deskew_along
 from lio_jax.lidar.thinning import ThinnedScan, thinned
-from lio_jax.mapping.voxel_map import VoxelMap, empty_map, insert
+from lio_jax.mapping.frame import Frame
+from lio_jax.mapping.voxel_map import VoxelMap, empty_map, following, insert
 from lio_jax.recipes import recipe
 from lio_jax.recipes.default_params import DefaultConfig, DefaultParams
 from lio_jax.recipes.inertial_filter import (
@@ -54,6 +55,10 @@ class InertialState(recipe.State):
     def estimate(self) -> NavEstimate:
         """The navigation state and its covariance."""
         return NavEstimate(self.nav, self.covariance)
+
+    def varying_map(self) -> VoxelMap:
+        """Return which leaves of the map have a derivative: the moments."""
+        return self.map.varying()
 
     def with_velocity_of(self, found: "InertialState") -> "InertialState":
         """Return this first state with the velocity of a later one."""
@@ -121,20 +126,19 @@ def step(
         new_piece = outage.begins_piece(lost, params.registration)
         T_world_lidar, T_matched = lidar_pose(posterior.nav), lidar_pose(matched)
         frame, matches = match.frame(), update.measurement.aux.association.found
-        evidence = point_evidence(matches, to_match, T_matched, frame, params.lidar, params.registration)
+        sigmas = params.lidar, params.registration
+        moments = matches.moments_in(state.map)
+        evidence = point_evidence(matches, to_match, T_matched, frame, *sigmas, moments)
         missed = jnp.linalg.norm((T_predicted.inverse() @ T_matched).translation())
         error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
     with jax.named_scope("insert"):
-        # the map is a constant of the derivative
         _, placed = jax.lax.stop_gradient(frame.place(points, T_matched))
+        inserted, size = thin.mask & (~lost | new_piece), params.map.voxel_size.astype(jnp.float32)
         vmap, added = insert(
-            state.map,
-            placed,
-            thin.mask & (~lost | new_piece),
-            frame.anchor,
-            params.map.voxel_size.astype(jnp.float32),
-            params.map.reach.astype(jnp.float32),
+            state.map, placed, inserted, frame.anchor, size, params.map.reach.astype(jnp.float32)
         )
+        again = _PlacedAgain(path, prior.nav.T_imu_lidar, thin, T_matched, frame)
+        vmap = following(vmap, state.map, added.added, placed, inserted, again, frame.anchor, size)
 
         new = jnp.sum(added.added) / jnp.maximum(jnp.sum(thin.mask), 1)
         drift = state.drift.carried(state.nav.T_world_imu, posterior.nav.T_world_imu)
@@ -169,6 +173,20 @@ def step(
         new_piece=new_piece,
         evidence=evidence_of(update, prior, evidence),
     )
+
+
+class _PlacedAgain(eqx.Module):
+    """Compensates and places some of the points that were inserted, for their derivative."""
+
+    path: Path
+    T_imu_lidar: jaxlie.SE3
+    thin: ThinnedScan
+    T_world_lidar: jaxlie.SE3
+    frame: Frame
+
+    def __call__(self, rows: Int32[Array, " n"]) -> Float[Array, "n 3"]:
+        points = deskew_along(self.path, self.T_imu_lidar, self.thin.points[rows], self.thin.time[rows])
+        return self.frame.place(points, self.T_world_lidar)[1]
 
 
 def _to_match(

@@ -13,9 +13,9 @@ from jaxtyping import Array, Float, Int32
 
 from lio_jax.core.types import LOST, NavState, Scan, initial_nav_state
 from lio_jax.lidar.deskew import TrialMotion, deskew_constant_velocity, twist_without_turn
-from lio_jax.lidar.thinning import thinned
+from lio_jax.lidar.thinning import ThinnedScan, thinned
 from lio_jax.mapping.frame import Frame
-from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
+from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, following, insert
 from lio_jax.recipes import recipe
 from lio_jax.recipes.default_params import DefaultConfig, DefaultParams
 from lio_jax.recipes.recipe import Outage, Output
@@ -41,6 +41,10 @@ class LidarState(recipe.State):
     unmatched: Float[Array, ""]
     """Time since the last scan that was matched, s."""
     map: VoxelMap
+
+    def varying_map(self) -> VoxelMap:
+        """Return which leaves of the map have a derivative: the moments."""
+        return self.map.varying()
 
     def with_velocity_of(self, found: "LidarState") -> "LidarState":
         """Return this first state with the velocity of a later one."""
@@ -118,16 +122,13 @@ def step(
     with jax.named_scope("insert"):
         T = result.T_world_lidar
         anchor, corner = anchor_of(T.translation(), params.map.voxel_size)
-        deskewed = deskew_constant_velocity(thin.points, thin.time - 0.5 * scan.duration, twist)
-        _, anchored = jax.lax.stop_gradient(Frame(anchor, corner).place(deskewed, T))
+        placing = _Placed(thin, 0.5 * scan.duration, twist, T, Frame(anchor, corner))
+        anchored = jax.lax.stop_gradient(placing(jnp.arange(len(thin.points), dtype=jnp.int32)))
+        inserted, size = thin.mask & (~lost | new_piece), params.map.voxel_size.astype(jnp.float32)
         vmap, added = insert(
-            state.map,
-            anchored,
-            thin.mask & (~lost | new_piece),
-            anchor,
-            params.map.voxel_size.astype(jnp.float32),
-            params.map.reach.astype(jnp.float32),
+            state.map, anchored, inserted, anchor, size, params.map.reach.astype(jnp.float32)
         )
+        vmap = following(vmap, state.map, added.added, anchored, inserted, placing, anchor, size)
 
     T_world_imu = T @ jaxlie.SE3.exp(motion.middle * twist) @ params.extrinsics.T_imu_lidar().inverse()
     nav = eqx.tree_at(
@@ -173,6 +174,21 @@ class _Deskewed(eqx.Module):
     def __call__(self, T_world_lidar: jaxlie.SE3) -> Float[Array, "k 3"]:
         """Return the points in the lidar frame of the scan's middle."""
         return self.motion.compensated(self.points, self.time, self.T_last.inverse() @ T_world_lidar)
+
+
+class _Placed(eqx.Module):
+    """Compensates and places some of the points that are inserted."""
+
+    thin: ThinnedScan
+    middle: Float[Array, ""]
+    twist: Float[Array, "6"]
+    T_world_lidar: jaxlie.SE3
+    frame: Frame
+
+    def __call__(self, rows: Int32[Array, " n"]) -> Float[Array, "n 3"]:
+        delay = self.thin.time[rows] - self.middle
+        points = deskew_constant_velocity(self.thin.points[rows], delay, self.twist)
+        return self.frame.place(points, self.T_world_lidar)[1]
 
 
 def _imu_velocity(

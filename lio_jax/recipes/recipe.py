@@ -82,7 +82,11 @@ class State(eqx.Module):
     nav: eqx.AbstractVar[NavState]
     """State at the last scan's end."""
     map: eqx.AbstractVar[Any]
-    """The map that scans are matched with: a pytree, which the derivative takes as constant."""
+    """The map that scans are matched with: a pytree."""
+
+    def varying_map(self) -> Any:
+        """Return which leaves of the map have a derivative: a prefix of its tree."""
+        return False
 
     @abstractmethod
     def with_velocity_of(self, found: Any) -> Any:
@@ -198,6 +202,8 @@ class Recipe(ABC, Generic[C, P, S]):
     near_values: ClassVar[Mapping[str, float]] = {}
     """Values by path that replace the defaults where a recording's surroundings are near, m; none: the recipe
     has one set of values for all surroundings."""
+    map_varies: ClassVar[bool] = False
+    """Whether derivatives go through the map: :meth:`State.varying_map` of its states names leaves."""
     given_values: ClassVar[Mapping[str, Any]] = {}
     """Values by path in which the recipe differs from the defaults of the back end and of the runner."""
 

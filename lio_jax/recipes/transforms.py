@@ -69,38 +69,52 @@ class WithTangents:
     """A recipe whose params, state and output are :class:`Dual`, by forward-mode differentiation."""
 
     recipe: RecipeLike
+    through_map: bool
 
     def init(self, params: Dual, imu: ImuBatch | None = None) -> Dual:
         """Return the state before the first scan and its derivatives."""
-        return push_forward(lambda params: self.recipe.init(params, imu), params)
+        return push_forward(
+            lambda params: self.recipe.init(params, imu), params, through_map=self.through_map
+        )
 
     def step(self, params: Dual, state: Dual, scan: Scan, imu: ImuBatch | None = None) -> tuple[Dual, Dual]:
         """Return state and output after a scan, and their derivatives."""
-        both = push_forward(lambda params, state: self.recipe.step(params, state, scan, imu), params, state)
+
+        def one_step(params: Any, state: Any) -> tuple[Any, Any]:
+            return self.recipe.step(params, state, scan, imu)
+
+        both = push_forward(one_step, params, state, through_map=self.through_map)
         new, output = map(Dual, both.value, both.dot)
         return new, output
 
 
-def with_tangents(recipe: RecipeLike) -> WithTangents:
-    """Return the recipe with derivatives by the parameters; the map is a constant of them.
+def with_tangents(recipe: RecipeLike, through_map: bool = False) -> WithTangents:
+    """Return the recipe with derivatives by the parameters.
 
     Solves are differentiated implicitly (:mod:`lio_jax.core.implicit`): a tangent costs no iterations.
+
+    Args:
+        recipe: hashable.
+        through_map: what the map knows of its points moves with the poses at which they were inserted, in
+            recipes whose states say so (:meth:`lio_jax.recipes.recipe.State.varying_map`); False: the map is
+            a constant of the derivative.
     """
-    return WithTangents(recipe)
+    return WithTangents(recipe, through_map)
 
 
-def push_forward(function: Callable[..., Any], *arguments: Dual) -> Dual:
+def push_forward(function: Callable[..., Any], *arguments: Dual, through_map: bool = False) -> Dual:
     """Return a function's value and its derivatives.
 
     Args:
         function: pure.
         arguments: P derivatives each.
+        through_map: see :func:`with_tangents`.
     """
     halves = [_split(argument) for argument in arguments]
 
     def of_smooth(*smooth: Any) -> tuple[Any, Any]:
         whole = (eqx.combine(part, rest) for part, (_, rest) in zip(smooth, halves, strict=True))
-        return split_smooth(function(*whole))
+        return split_smooth(function(*whole), through_map)
 
     def along(*tangents: Any) -> tuple[Any, Any, Any]:
         primals = tuple(smooth for smooth, _ in halves)
@@ -112,12 +126,16 @@ def push_forward(function: Callable[..., Any], *arguments: Dual) -> Dual:
     return Dual(eqx.combine(value, rest), dot)
 
 
-def split_smooth(tree: Any) -> tuple[Any, Any]:
-    """Return what has a derivative in a tree, and the rest: the maps of states, and all counts and choices.
+def split_smooth(tree: Any, through_map: bool) -> tuple[Any, Any]:
+    """Return what has a derivative in a tree, and the rest, such as counts and choices.
 
     Each is the tree with None in place of the other's leaves.
+
+    Args:
+        tree: anything, with states of recipes in it.
+        through_map: whether what a state's map knows of its points is part of the first.
     """
-    smooth = jax.tree.map(_smooth, tree, is_leaf=_is_state)
+    smooth = jax.tree.map(lambda node: _smooth(node, through_map), tree, is_leaf=_is_state)
     return eqx.partition(tree, smooth)
 
 
@@ -126,10 +144,11 @@ def _split(dual: Dual) -> tuple[Any, Any]:
     return eqx.partition(dual.value, varies)
 
 
-def _smooth(node: Any) -> Any:
+def _smooth(node: Any, through_map: bool) -> Any:
     if not _is_state(node):
         return eqx.is_inexact_array(node)
-    return eqx.tree_at(lambda state: state.map, jax.tree.map(eqx.is_inexact_array, node), False)
+    varying = node.varying_map() if through_map else False
+    return eqx.tree_at(lambda state: state.map, jax.tree.map(eqx.is_inexact_array, node), varying)
 
 
 def _is_state(node: Any) -> bool:

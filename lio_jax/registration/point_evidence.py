@@ -31,6 +31,7 @@ def point_evidence(
     frame: Frame,
     lidar: BeamParams,
     registration: RobustFilterMatch,
+    moments: Float[Array, "k 10"] | None = None,
 ) -> PointEvidence:
     """Return the statistics of the matched points at a pose, with the weights of the solve.
 
@@ -41,6 +42,7 @@ def point_evidence(
         frame: of the matches.
         lidar: the noise of ranges and directions.
         registration: the kernel, and how many points each counts as.
+        moments: of the matched voxels, by which the statistics have a derivative.
     """
     kind, dtype = points.dtype, T_world_lidar.wxyz_xyz.dtype
     noise = point_noise(matches, points, T_world_lidar, frame, lidar)
@@ -52,15 +54,18 @@ def point_evidence(
         points,
         *frame.placing(T_world_lidar, kind),
         jnp.stack(point_variances(lidar, kind)),
+        moments,
         (matches, weight),
     ).astype(dtype)
     squared_error, log_det = sums
     return PointEvidence(squared_error, log_det, registration.information_scale.astype(dtype))
 
 
-def _rows(arm: Array, shift: Array, scales: Array, constants: tuple[Matches, Array]) -> Array:
+def _rows(
+    arm: Array, shift: Array, scales: Array, moments: Array | None, constants: tuple[Matches, Array]
+) -> Array:
     matches, weight = constants
-    return _weighted(plane_noise(matches, arm.T, shift, *scales), weight)
+    return _weighted(plane_noise(matches.following(moments), arm.T, shift, *scales), weight)
 
 
 def _weighted(noise: PointNoise, weight: Array) -> Array:

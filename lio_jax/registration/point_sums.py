@@ -1,6 +1,7 @@
 """Sums over a scan's points at a pose, whose derivative costs little however many parameters there are."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -10,9 +11,9 @@ from jaxtyping import Array, Float
 
 from lio_jax.core.implicit import with_derivative_of
 
-Rows = Callable[[Array, Array, Array, Any], Array]
-"""``(arm (3, k), shift (3,), scales (s,), constants) -> (m, k)``: what each point adds to m sums. Its place
-in world axes is ``arm`` from the sensor and ``arm + shift`` from the map's origin."""
+Rows = Callable[[Array, Array, Array, Any, Any], Array]
+"""``(arm (3, k), shift (3,), scales (s,), met (k, j), constants) -> (m, k)``: what each point adds to m sums.
+Its place in world axes is ``arm`` from the sensor and ``arm + shift`` from the map's origin."""
 
 
 def point_sums(
@@ -22,6 +23,7 @@ def point_sums(
     R_world_lidar: Float[Array, "3 3"],
     shift: Float[Array, "3"],
     scales: Float[Array, " s"],
+    met: Float[Array, "k j"] | None,
     constants: Any,
 ) -> Float[Array, " m"]:
     """Return ``total``, computed already, with the derivative of the sum of ``rows`` over the points.
@@ -37,39 +39,48 @@ def point_sums(
         R_world_lidar: turns them into ``arm``.
         shift: see :data:`Rows`, m.
         scales: anything smooth that all points share.
+        met: anything smooth that the map knows about where each point lies; None: the map has no derivative.
         constants: a pytree without a derivative.
     """
     # zeros are for the products with the pose's tangents; a row that counts keeps its point
     finite = jax.lax.stop_gradient(jnp.where(jnp.isfinite(points), points, 0.0))
     points = with_derivative_of(finite, lambda points: points, points)
-    return _summed(total, rows, points, R_world_lidar, shift, scales, constants)
+    return _summed(total, rows, points, R_world_lidar, shift, scales, met, constants)
 
 
 @eqx.filter_custom_jvp
 def _summed(
-    total: Array, rows: Rows, points: Array, R: Array, shift: Array, scales: Array, constants: Any
+    total: Array,
+    rows: Rows,
+    points: Array,
+    R: Array,
+    shift: Array,
+    scales: Array,
+    met: Array | None,
+    constants: Any,
 ) -> Array:
     return total
 
 
 @_summed.def_jvp
 def _summed_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    total, rows, points, R, shift, scales, constants = primals
-    points_dot, R_dot, shift_dot, scales_dot = tangents[2:6]
+    total, rows, points, R, shift, scales, met, constants = primals
+    points_dot, R_dot, shift_dot, scales_dot, met_dot = tangents[2:7]
     arm = R @ points.T
+    arguments = [arm, shift, scales, met]
+
+    def along(by: int, direction: Array) -> Array:
+        def moved(argument: Array) -> Array:
+            return rows(*arguments[:by], argument, *arguments[by + 1 :], constants)
+
+        return jax.jvp(moved, (arguments[by],), (direction,))[1]
 
     def slopes(by: int) -> Array:
         """Return the rows' derivatives by each component of one of their arguments."""
-        arguments = [arm, shift, scales]
-
-        def along(unit: Array) -> Array:
-            def moved(argument: Array) -> Array:
-                return rows(*arguments[:by], argument, *arguments[by + 1 :], constants)
-
-            direction = jnp.broadcast_to(unit[:, None], arm.shape) if by == 0 else unit
-            return jax.jvp(moved, (arguments[by],), (direction,))[1]
-
-        return jax.vmap(along)(jnp.eye(len(arguments[by]), dtype=points.dtype))
+        shape = arguments[by].shape
+        units = jnp.eye(shape[1 if by == 3 else 0], dtype=points.dtype)
+        spread = {0: units[:, :, None], 3: units[:, None, :]}.get(by, units)
+        return jax.vmap(partial(along, by))(jnp.broadcast_to(spread, (len(units), *shape)))
 
     by_place = slopes(0)
     total_dot = jnp.zeros_like(total)
@@ -82,4 +93,6 @@ def _summed_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
         total_dot += shift_dot @ jnp.sum(slopes(1), -1)
     if scales_dot is not None:
         total_dot += scales_dot @ jnp.sum(slopes(2), -1)
+    if met_dot is not None:
+        total_dot += jnp.tensordot(slopes(3), met_dot, ((0, 2), (1, 0)))
     return total, total_dot

@@ -1,16 +1,22 @@
 """Match a scan with the planes of a voxel map: point-to-plane distances, robustly weighted by their noise."""
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float, Float32, Int32
+from jax.typing import DTypeLike
+from jaxtyping import Array, Bool, Float, Int32
 
+from lio_jax.core.geometry import across
+from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.xla import computed_once
 from lio_jax.lidar.params import BeamParams
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.params import VoxelMapParams
-from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, query_nearest
+from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, mean_and_covariance, query_nearest
 from lio_jax.registration.params import RobustMatch
 from lio_jax.registration.point_sums import point_sums
 from lio_jax.registration.scan_match import NormalEquations, ScanMatch
@@ -19,16 +25,31 @@ from lio_jax.registration.scan_match import NormalEquations, ScanMatch
 class Matches(eqx.Module):
     """What each point was associated with, in world axes from ``origin``."""
 
-    mean: Float32[Array, "k 3"]
+    mean: Float[Array, "k 3"]
     """m."""
-    normal: Float32[Array, "k 3"]
+    normal: Float[Array, "k 3"]
     """Unit normal of each voxel's plane."""
-    variances: Float32[Array, "k 2"]
+    variances: Float[Array, "k 2"]
     """The voxel's two smaller variances, ascending, m^2."""
-    count: Float32[Array, " k"]
+    count: Float[Array, " k"]
     """Number of points of the voxel."""
+    slot: Int32[Array, " k"]
+    """Where the map holds the voxel."""
     used: Bool[Array, " k"]
     """True where a point has a match."""
+
+    def moments_in(self, vmap: VoxelMap) -> Float[Array, "k 10"]:
+        """Return the moments of the voxels, by which the matches have a derivative."""
+        return vmap.moments.at[self.slot].get(mode="promise_in_bounds")
+
+    def following(self, moments: Float[Array, "k 10"] | None) -> "Matches":
+        """Return the same matches with their derivative by the moments; None: they are constants."""
+        if moments is None:
+            return self
+        held, normal = jax.lax.stop_gradient((moments, self.normal))
+        known = Surface(self.mean, normal, self.variances)
+        surface = with_derivative_of(known, surface_slope, held, normal, moments)
+        return replace(self, mean=surface.mean, normal=surface.normal, variances=surface.variances)
 
 
 def associate(
@@ -48,13 +69,84 @@ def associate(
         map_params.voxel_size.astype(jnp.float32),
         map_params.min_points.astype(jnp.float32),
     )
-    return Matches(near.mean, near.normal, near.variances, near.count, mask & near.valid)
+    return Matches(near.mean, near.normal, near.variances, near.count, near.slot, mask & near.valid)
 
 
-def no_matches(mask: Bool[Array, " k"]) -> Matches:
-    """Return matches of none of the points."""
-    zeros = jnp.zeros((*mask.shape, 3), jnp.float32)
-    return Matches(zeros, zeros, zeros[:, :2], zeros[:, 0], jnp.zeros_like(mask))
+def no_matches(mask: Bool[Array, " k"], dtype: DTypeLike) -> Matches:
+    """Return matches of none of the points, with a map of this dtype."""
+    zeros = jnp.zeros((*mask.shape, 3), dtype)
+    return Matches(
+        zeros, zeros, zeros[:, :2], zeros[:, 0], jnp.zeros(len(mask), jnp.int32), jnp.zeros_like(mask)
+    )
+
+
+class Surface(NamedTuple):
+    """The distributions of k voxels, with means relative to their centres."""
+
+    mean: Float[Array, "k 3"]
+    normal: Float[Array, "k 3"]
+    variances: Float[Array, "k 2"]
+
+
+def surface_slope(
+    moments: Float[Array, "k 10"], normal: Float[Array, "k 3"], change: Float[Array, "k 10"]
+) -> Surface:
+    """Return how means, normals and the two smaller variances change with the moments.
+
+    With A n = l n, a change dA turns the normal by -(A - l I)^+ dA n and changes a variance of direction v by
+    v' dA v (Magnus, "On differentiating eigenvalues and eigenvectors", 1985). In the inverse, a gap g between
+    variances becomes (g^2 + e^2) / g with a tiny e, because the normal is undefined where two variances
+    meet; a match gives it no weight there.
+
+    Args:
+        moments: of each voxel.
+        normal: of each voxel's plane.
+        change: of the moments; that of the number of points has no effect.
+    """
+    count = jnp.maximum(moments[:, :1], 1.0)
+    mean, diagonal, off_diagonal = mean_and_covariance(moments)
+    moved = change[:, 1:4] / count
+    A = _symmetric(diagonal, off_diagonal)
+    both = mean[:, :, None] * moved[:, None, :]
+    dA = _symmetric(change[:, 4:7] / count, change[:, 7:10] / count) - both - jnp.swapaxes(both, 1, 2)
+    basis = jnp.stack(across(normal), -1)
+
+    def within(matrix: Array, left: Array, right: Array) -> Array:
+        return jnp.einsum("kia,kij,kjb->kab", left, matrix, right)
+
+    n = normal[:, :, None]
+    smallest, change_of_smallest = within(A, n, n)[:, 0, 0], within(dA, n, n)[:, 0, 0]
+    M, dM = within(A, basis, basis), within(dA, basis, basis)
+    half, mixed = (M[:, 0, 0] - M[:, 1, 1]) / 2, M[:, 0, 1]
+    radius = jnp.sqrt(jnp.maximum(half**2 + mixed**2, 1e-30))
+    change_of_radius = (half * (dM[:, 0, 0] - dM[:, 1, 1]) / 2 + mixed * dM[:, 0, 1]) / radius
+    change_of_middle = (dM[:, 0, 0] + dM[:, 1, 1]) / 2 - change_of_radius
+
+    middle = (M[:, 0, 0] + M[:, 1, 1]) / 2 - smallest
+    least = _LEAST_GAP * (M[:, 0, 0] + M[:, 1, 1]) + _LEAST_VARIANCE
+    low, high = (gap / (gap**2 + least**2) for gap in (middle - radius, middle + radius))
+    mean_inverse, cosine, sine = (
+        (low + high) / 2,
+        *((high - low) / 2 * side / radius for side in (half, mixed)),
+    )
+    c, d = within(dA, basis, n)[:, :, 0].T
+    turn = jnp.stack([mean_inverse * c + cosine * c + sine * d, mean_inverse * d + sine * c - cosine * d], -1)
+    return Surface(
+        moved,
+        -jnp.einsum("kia,ka->ki", basis, turn),
+        jnp.stack([change_of_smallest, change_of_middle], -1),
+    )
+
+
+def _symmetric(diagonal: Float[Array, "k 3"], off_diagonal: Float[Array, "k 3"]) -> Array:
+    (xx, yy, zz), (xy, xz, yz) = diagonal.T, off_diagonal.T
+    return jnp.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
+
+
+_LEAST_GAP = 1e-6
+"""Share of the larger variances below which the gap between the two smaller ones counts as none."""
+_LEAST_VARIANCE = 1e-9
+"""The same for all variances, m^2: a voxel may hold coincident points."""
 
 
 class PointNoise(eqx.Module):
@@ -128,8 +220,11 @@ def linearise(
     frame: Frame,
     kernel: Float[Array, ""],
     lidar: BeamParams,
+    moments: Float[Array, "k 10"] | None = None,
 ) -> NormalEquations:
     """Return the robustly weighted normal equations of associated points at a pose.
+
+    ``moments`` are those of the matched voxels, by which the equations have a derivative.
 
     Robust weight: Geman-McClure on s sqrt(k) n'e, the noise-scaled distance in m of a point at offset e from
     its plane's mean, with precision k and s^2 of range and surface.
@@ -160,6 +255,7 @@ def linearise(
         points,
         *frame.placing(T_world_lidar, kind),
         jnp.stack([*point_variances(lidar, kind), kernel.astype(kind)]),
+        moments,
         matches,
     ).astype(dtype)
     hessian, count = total[:36].reshape(6, 6), sums[7, 8]
@@ -174,9 +270,10 @@ def linearise(
     )
 
 
-def _rows(arm: Array, shift: Array, scales: Array, matches: Matches) -> Array:
+def _rows(arm: Array, shift: Array, scales: Array, moments: Array | None, matches: Matches) -> Array:
     """Return what each point adds to the sums of :func:`linearise`."""
     facing, turning, kernel = scales
+    matches = matches.following(moments)
     noise = plane_noise(matches, arm.T, shift, facing, turning)
     weight = noise.weight(kernel)
     believed = weight * noise.precision
@@ -213,7 +310,7 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
         return points, self.mask
 
     def unmatched(self) -> Matches:
-        return no_matches(self.mask)
+        return no_matches(self.mask, self.map.moments.dtype)
 
     def associate(self, points: Float[Array, "k 3"], T_world_lidar: jaxlie.SE3) -> Matches:
         return associate(self.map, points, self.mask, T_world_lidar, self.frame(), self.map_params)
@@ -223,7 +320,8 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
     ) -> NormalEquations:
         kernel = self.registration.kernel + self.opening(iteration)
         points = self.points_at(T_world_lidar)
-        return linearise(found, points, T_world_lidar, self.frame(), kernel, self.lidar)
+        moments = found.moments_in(self.map)
+        return linearise(found, points, T_world_lidar, self.frame(), kernel, self.lidar, moments)
 
     def settled(self, iteration: Int32[Array, ""]) -> Bool[Array, ""]:
         return self.opening(iteration) < self.registration.kernel

@@ -15,7 +15,7 @@ from lio_jax.recipes import recipe_named
 from lio_jax.recipes.params import RecipeConfig as Config
 from lio_jax.run.run import settings_for
 from lio_jax.settings.settings import Settings, recipe_of, recipe_settings
-from lio_jax.tuning.objectives import Objective, objective_named
+from lio_jax.tuning.objectives import Named, Objective, objective_named
 from lio_jax.tuning.parameters import ParameterVector, free_parameters
 from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.reverse import checkpointed_gradient
@@ -31,6 +31,8 @@ class NamedGradient:
     """By the logarithm of positive parameters, by the others themselves (m, rad, s)."""
     unconverged: tuple[int, ...]
     """Scans whose solve did not converge: the derivative is not to be trusted."""
+    through_map: bool
+    """Whether the derivative goes through the map; False: the map was a constant of it."""
 
 
 def gradient(
@@ -42,6 +44,7 @@ def gradient(
     start: int = 0,
     count: int | None = None,
     mode: Literal["forward", "reverse"] = "forward",
+    through_map: bool | None = None,
 ) -> NamedGradient:
     """Return the objective of a recording and its gradient.
 
@@ -58,6 +61,9 @@ def gradient(
         count: number of scans; None: to the end.
         mode: forward: constant memory, time grows with the number of parameters; reverse: time does not grow
             with it, memory grows with the number of scans, all of which are kept.
+        through_map: whether the map moves with the poses at which its points were inserted, which costs time
+            and 40 bytes per slot of the map and parameter; None: where :func:`wants_map` says so and the
+            recipe can.
 
     Raises:
         UsageError: a parameter, an objective or a mode is not known, or can't be differentiated.
@@ -66,12 +72,33 @@ def gradient(
         raise UsageError(f"mode '{mode}' is not known; there are: forward, reverse.")
     resolved, _ = settings_for(sequence, settings or recipe_settings("default"))
     free = free_parameters(resolved.params(), list(patterns))
-    chosen = objective_named(objective).objective if isinstance(objective, str) else objective
+    named = objective_named(objective) if isinstance(objective, str) else Named(objective, False, False)
+    recipe = recipe_of(resolved)
+    if through_map and not recipe.map_varies:
+        raise UsageError(
+            f"the recipe {resolved.recipe} takes its map as a constant of the derivative: leave through_map "
+            "out, or use the recipe default."
+        )
+    through_map = recipe.map_varies and (wants_map(named, free) if through_map is None else through_map)
     recording = Recording(sequence, resolved, start, count, truth, keep=False)
     differentiate = streaming_gradient if mode == "forward" else checkpointed_gradient
-    result = differentiate(recipe_of(resolved), free, chosen, free.first(), recording)
+    result = differentiate(recipe, free, named.objective, free.first(), recording, through_map=through_map)
     by_name = dict(zip(free.names, result.gradient.tolist(), strict=True))
-    return NamedGradient(result.value, by_name, result.unconverged)
+    return NamedGradient(result.value, by_name, result.unconverged, through_map)
+
+
+def wants_map(named: Named, free: ParameterVector) -> bool:
+    """Return whether a derivative is wrong as long as the map is a constant of it.
+
+    It is for trajectory errors, the blur of the map and all derivatives by extrinsics, and it is not for
+    likelihoods by noise densities and weights: ``python experiments/gradient_check.py`` compares both with
+    the slope of the objective.
+
+    Args:
+        named: the objective.
+        free: the parameters.
+    """
+    return not named.likelihood or any(path.startswith("extrinsics.") for path in free.paths)
 
 
 @dataclass(frozen=True)
@@ -91,13 +118,24 @@ class Evaluated:
 class Loss:
     """Mean objective over recordings, weighted by their numbers of scans."""
 
-    def __init__(self, recipe: str, config: Config, free: ParameterVector, objective: Objective) -> None:
-        """Keep what the loss is of."""
+    def __init__(
+        self,
+        recipe: str,
+        config: Config,
+        free: ParameterVector,
+        objective: Objective,
+        through_map: bool = False,
+    ) -> None:
+        """Keep what the loss is of, and whether its derivative goes through the map."""
         self._loss_of = recipe_named(recipe)(config), free, objective
+        self._through_map = through_map
 
     def __call__(self, x: NDArray[np.float64], recordings: Listing[Recording]) -> Evaluated:
         """Return the loss at a vector of parameters, with its gradient."""
-        results = [streaming_gradient(*self._loss_of, jnp.asarray(x), recording) for recording in recordings]
+        results = [
+            streaming_gradient(*self._loss_of, jnp.asarray(x), recording, self._through_map)
+            for recording in recordings
+        ]
         counts = np.array([len(result.scores) for result in results])
         shares = counts / counts.sum()
         return Evaluated(

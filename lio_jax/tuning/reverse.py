@@ -44,6 +44,7 @@ def checkpointed_gradient(
     x: Array,
     recording: Recording,
     every: int | None = None,
+    through_map: bool = False,
 ) -> TotalGradient:
     """Return an objective and its gradient by reverse mode.
 
@@ -54,9 +55,11 @@ def checkpointed_gradient(
         x: (p,) where.
         recording: run through once; its scans are kept until the way back.
         every: steps between checkpoints; None: the square root of their number.
+        through_map: see :func:`lio_jax.recipes.transforms.with_tangents`.
     """
     every = every or max(1, math.isqrt(len(recording)))
-    tape = _Tape(Observing(recipe), free.split(programs(ParameterVector.__call__)(free, x)), objective, every)
+    params = free.split(programs(ParameterVector.__call__)(free, x))
+    tape = _Tape(Observing(recipe), params, objective, every, through_map)
     unconverged = []
     for fed, state, seen in run_steps(tape, recording.scan_inputs()):
         tape.count(state, seen, fed.scan, recording.truth_at(fed.end_ns))
@@ -100,7 +103,12 @@ class _Tape:
     """A :class:`lio_jax.recipes.transforms.Stepper` that remembers what it did."""
 
     def __init__(
-        self, recipe: RecipeLike, params: tuple[Params, Params], objective: Objective, every: int
+        self,
+        recipe: RecipeLike,
+        params: tuple[Params, Params],
+        objective: Objective,
+        every: int,
+        through_map: bool,
     ) -> None:
         """Begin a tape.
 
@@ -109,16 +117,17 @@ class _Tape:
             params: the leaves that are tuned, and the others.
             objective: of the whole recording.
             every: steps between checkpoints.
+            through_map: see :func:`lio_jax.recipes.transforms.with_tangents`.
         """
-        self._params, self._every = params, every
+        self._params, self._every, self._through_map = params, every, through_map
         self._arrays, static = split_objective(objective)
         # unlike a run's, these don't consume the state, which may be a checkpoint
         self._init = programs(type(recipe).init, recipe)
         self._step = programs(type(recipe).step, recipe)
         self._add = programs(add_scan, static)
         self._value = programs(_value_and_slopes, static)
-        self._pull_init = programs(_pull_init, recipe)
-        self._pull_step = programs(_pull_step, recipe, static)
+        self._pull_init = programs(_pull_init, recipe, through_map)
+        self._pull_step = programs(_pull_step, recipe, static, through_map)
         self._operations: list[_Operation] = []
         self._kept: dict[int, Any] = {}
         self._sums = objective.start()
@@ -163,7 +172,7 @@ class _Tape:
             for number, one in reversed(list(enumerate(segment, start))):
                 bar = bars.pop(number, None)
                 if bar is None:
-                    bar = jax.tree.map(jnp.zeros_like, split_smooth(states[number])[0])
+                    bar = jax.tree.map(jnp.zeros_like, split_smooth(states[number], self._through_map)[0])
                 given = tuple(states[source] for source in one.sources)
                 own, sources, sums_bar = self._pulled(one, given, bar, sums_bar)
                 params_bar = jax.tree.map(jnp.add, params_bar, own)
@@ -203,7 +212,7 @@ class _Tape:
         if given:
             first, found = given
             none = jax.tree.map(jnp.zeros_like, self._params[0])
-            return none, _pull_velocity(first, found, bar), sums_bar
+            return none, _pull_velocity(self._through_map, first, found, bar), sums_bar
         tuned, others = self._params
         others = with_first_velocity(others, operation.velocity)
         return self._pull_init((tuned, others), operation.imu, bar), (), sums_bar
@@ -213,11 +222,17 @@ def _pull_params(free: ParameterVector, x: Array, bar: Params) -> Array:
     return jax.vjp(lambda x: free.split(free(x))[0], x)[1](bar)[0]
 
 
-def _pull_init(recipe: RecipeLike, params: tuple[Params, Params], imu: ImuBatch | None, bar: Any) -> Params:
+def _pull_init(
+    recipe: RecipeLike,
+    through_map: bool,
+    params: tuple[Params, Params],
+    imu: ImuBatch | None,
+    bar: Any,
+) -> Params:
     tuned, others = params
 
     def init(tuned: Params) -> Any:
-        return split_smooth(recipe.init(eqx.combine(tuned, others), imu))[0]
+        return split_smooth(recipe.init(eqx.combine(tuned, others), imu), through_map)[0]
 
     return jax.vjp(init, tuned)[1](bar)[0]
 
@@ -225,6 +240,7 @@ def _pull_init(recipe: RecipeLike, params: tuple[Params, Params], imu: ImuBatch 
 def _pull_step(
     recipe: RecipeLike,
     static: Any,
+    through_map: bool,
     arrays: Any,
     params: tuple[Params, Params],
     state: Any,
@@ -235,24 +251,24 @@ def _pull_step(
     bar: Any,
     sums_bar: Any,
 ) -> tuple[Params, Any, Any]:
-    (tuned, others), (smooth, fixed) = params, split_smooth(state)
+    (tuned, others), (smooth, fixed) = params, split_smooth(state, through_map)
 
     def step(tuned: Params, smooth: Any, sums: Any) -> tuple[Any, Any]:
         whole = eqx.combine(tuned, others)
         new, seen = recipe.step(whole, eqx.combine(smooth, fixed), scan, imu)
         if truth is not None:
             sums = add_scan(static, arrays, whole, sums, seen, scan, truth)
-        return split_smooth(new)[0], sums
+        return split_smooth(new, through_map)[0], sums
 
     return jax.vjp(step, tuned, smooth, sums)[1]((bar, sums_bar))
 
 
-def _pull_velocity(first: Any, found: Any, bar: Any) -> tuple[Any, Any]:
-    halves = split_smooth(first), split_smooth(found)
+def _pull_velocity(through_map: bool, first: Any, found: Any, bar: Any) -> tuple[Any, Any]:
+    halves = split_smooth(first, through_map), split_smooth(found, through_map)
 
     def hand_over(*smooth: Any) -> Any:
         whole = [eqx.combine(own, rest) for own, (_, rest) in zip(smooth, halves, strict=True)]
-        return split_smooth(whole[0].with_velocity_of(whole[1]))[0]
+        return split_smooth(whole[0].with_velocity_of(whole[1]), through_map)[0]
 
     return jax.vjp(hand_over, *(smooth for smooth, _ in halves))[1](bar)
 

@@ -1,7 +1,7 @@
 """A whole recording's objective in constant memory: its gradient, or its values at several vectors at once.
 
-For P parameters, P tangents of the state (without the map, which is a constant of the derivative) and of the
-objective's running sums go through each step by forward-mode differentiation.
+For P parameters, P tangents of the state and of the objective's running sums go through each step by
+forward-mode differentiation. The state's map has tangents where the derivative is to go through it.
 """
 
 from typing import Any, NamedTuple
@@ -36,7 +36,12 @@ class Gradient(NamedTuple):
 
 
 def streaming_gradient(
-    recipe: RecipeLike, free: ParameterVector, objective: Objective, x: Array, recording: Recording
+    recipe: RecipeLike,
+    free: ParameterVector,
+    objective: Objective,
+    x: Array,
+    recording: Recording,
+    through_map: bool = False,
 ) -> Gradient:
     """Return an objective and its gradient by forward mode.
 
@@ -46,6 +51,7 @@ def streaming_gradient(
         objective: of the whole recording.
         x: (p,) where.
         recording: run through once.
+        through_map: see :func:`lio_jax.recipes.transforms.with_tangents`.
     """
     params = programs(ParameterVector.with_tangents)(free, x)
     arrays, static = split_objective(objective)
@@ -54,7 +60,7 @@ def streaming_gradient(
     dots = jax.tree.map(lambda leaf: jnp.zeros((len(x), *leaf.shape), leaf.dtype), sums)
     total = Dual(sums, dots)
     shares, unconverged = [], []
-    stepper = Compiled(with_tangents(Observing(recipe)), params)
+    stepper = Compiled(with_tangents(Observing(recipe), through_map), params)
     for fed, _, seen in run_steps(stepper, recording.scan_inputs()):
         before = total.dot
         total = add(arrays, params, total, seen, fed.scan, recording.truth_at(fed.end_ns))

@@ -1,0 +1,73 @@
+"""The derivative of a voxel map's moments by the points that were inserted, forgotten voxels included."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lio_jax.mapping.voxel_map import FREE, empty_map, following, insert
+
+SIZE, REACH = jnp.float64(1.0), jnp.float64(40.0)
+RNG = np.random.default_rng(3)
+
+
+class Moved(eqx.Module):
+    """Points that move with a few parameters."""
+
+    points: jax.Array
+    directions: jax.Array
+    parameters: jax.Array
+
+    def __call__(self, rows):
+        return (self.points + jnp.tensordot(self.parameters, self.directions, 1))[rows]
+
+
+def drive(parameters, clouds, anchors, capacity):
+    """Return the map after the clouds, each of which moves with the parameters."""
+    vmap = empty_map(capacity, jnp.float64)
+    for (points, directions), anchor in zip(clouds, anchors, strict=True):
+        again = Moved(points, directions, parameters)
+        placed = jax.lax.stop_gradient(again(jnp.arange(len(points))))
+        mask = jnp.arange(len(points)) % 10 != 0
+        after, added = insert(vmap, placed, mask, anchor, SIZE, REACH)
+        vmap = following(after, vmap, added.added, placed, mask, again, anchor, SIZE)
+    return vmap
+
+
+def cloud(count):
+    return jnp.asarray(RNG.uniform(-6, 6, (count, 3))), jnp.asarray(RNG.normal(size=(2, count, 3)))
+
+
+# 1500 points take more than one chunk; the last anchor is out of the first one's reach, and the table is so
+# small that voxels are overwritten
+CLOUDS = [cloud(1500), cloud(700), cloud(900)]
+ANCHORS = [jnp.asarray(anchor, jnp.int32) for anchor in ([0, 0, 0], [1, 0, 0], [200, 3, 0])]
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_the_moments_follow_the_points(mode):
+    def moments(parameters):
+        return drive(parameters, CLOUDS, ANCHORS, 2048).moments
+
+    at = jnp.asarray([0.01, -0.02])
+    slope = mode(moments)(at)
+    first, last = (drive(at, CLOUDS[:end], ANCHORS[:end], 2048) for end in (2, 3))
+    forgotten = (first.voxel[:, 0] != FREE) & (first.voxel != last.voxel).any(1)
+    assert forgotten.sum() > 100
+    for component in range(2):
+        step = 1e-8 * np.eye(2)[component]
+        difference = (moments(at + step) - moments(at - step)) / 2e-8
+        np.testing.assert_allclose(slope[..., component], difference, atol=1e-5)
+
+
+def test_nothing_added_changes_nothing():
+    points, directions = cloud(50)
+    vmap = empty_map(256, jnp.float64)
+    nothing = jnp.zeros(50, bool)
+
+    def moments(parameters):
+        again = Moved(points, directions, parameters)
+        return following(vmap, vmap, nothing, points, nothing, again, ANCHORS[0], SIZE).moments
+
+    np.testing.assert_array_equal(jax.jacfwd(moments)(jnp.zeros(2)), 0.0)
