@@ -245,7 +245,8 @@ def _moments_after(
 ) -> Float[Array, "c 10"]:
     """Return the moments after an insertion whose choices are known."""
     old, vmap, added, points, mask, anchor, voxel_size = choices
-    capacity, count = len(old), len(added)
+    capacity, count, dtype = len(old), len(added), before.dtype
+    points, voxel_size = points.astype(dtype), voxel_size.astype(dtype)
     grid = _Grid(anchor, voxel_size, voxel_size)
     voxel, _, _ = grid.places(points)
     slot = find_slots(vmap, voxel)
@@ -264,7 +265,9 @@ def _moments_after(
 
     def changes(some: Array) -> Array:
         # the module is an argument, because its arrays have a derivative
-        again = with_derivative_of(_take(points, some), lambda place, rows: place(rows), placed_again, some)
+        again = with_derivative_of(
+            _take(points, some), lambda place, rows: place(rows).astype(dtype), placed_again, some
+        )
         _, _, offset = grid.places(again)
         gains = jnp.where(_take(added, some)[:, None], _moment_row(offset), 0.0)
         loses = jnp.where(_take(clears, some)[:, None], _take(before, _take(held, some)), 0.0)
@@ -272,9 +275,7 @@ def _moments_after(
 
     def chunk(number: Array) -> Array:
         some = jax.lax.dynamic_slice(rows, (number * size,), (size,))
-        return jax.lax.cond(
-            number * size < total, changes, lambda rows: jnp.zeros((size, 10), before.dtype), some
-        )
+        return jax.lax.cond(number * size < total, changes, lambda rows: jnp.zeros((size, 10), dtype), some)
 
     # a single addition, outside of branches and loops: only then XLA writes into the table where it lies
     change = jax.lax.map(chunk, jnp.arange(padded // size)).reshape(padded, 10)
