@@ -6,9 +6,10 @@ python experiments/gradient_check.py RECORDING [--objective ate] [--recipe defau
 
 Each parameter takes evenly spaced values around its own. The slope is that of the straight line through the
 objective's values; its standard error tells how far they lie from the line. A positive parameter varies by
-its logarithm, so a width of 0.3 is about 30 %; an extrinsic varies by 0.07 of the width (m or rad). The last
-two columns show how often choices differ between neighbouring runs: the share of inserted points that only
-one of the two inserted, and the share of scans with different numbers of iterations.
+its logarithm, so a width of 0.3 is about 30 %; a length or a time varies by 0.07 of the width (m, s), an
+angle by 0.02 of it (rad). The last two columns show how often choices differ between neighbouring runs: the
+share of inserted points that only one of the two inserted, and the share of scans with different numbers of
+iterations.
 """
 
 import argparse
@@ -26,8 +27,8 @@ PARAMETERS = (
     "registration.kernel,registration.information_scale,lidar.range_sigma,imu.gyro_noise,imu.accel_noise,"
     "extrinsics.translation"
 )
-EXTRINSIC_SHARE = 0.07
-"""Width of an extrinsic's range as a share of that of a positive parameter, m or rad."""
+LENGTH_SHARE, ANGLE_SHARE = 0.07, 0.02
+"""Widths of the ranges of lengths and times (m, s) and of angles (rad), as shares of that of a logarithm."""
 
 
 @dataclass(frozen=True)
@@ -78,15 +79,15 @@ def main() -> None:
     free = free_parameters(settings.params(), options.params.split(","))
     recording = Recording(sequence, settings, options.start, options.scans)
     x = np.asarray(free.first())
-    through_map = recipe.map_varies and wants_map(named, free)
+    through_map = wants_map(named, free)
     reported = streaming_gradient(recipe, free, named.objective, jnp.asarray(x), recording, through_map)
     print(f"{options.objective} = {reported.value:.6g} over {len(recording)} scans, ", end="")
     print(f"map {'differentiated' if through_map else 'constant'}, {len(reported.unconverged)} unconverged")
     print(f"{'by':34s} {'width':>6s} {'reported':>11s} {'slope':>11s} {'sigma':>9s} {'ratio':>7s}", end="")
     print(f" {'points':>7s} {'iterations':>10s}")
-    for component, name in enumerate(free.names):
+    for component, (name, declared) in enumerate(zip(free.names, free.declared, strict=True)):
         for width in options.widths:
-            scale = width * (EXTRINSIC_SHARE if name.startswith("extrinsics") else 1.0)
+            scale = width * share_of(declared)
             offsets = np.linspace(-scale, scale, options.runs)
             rows = x + offsets[:, None] * (np.arange(len(x)) == component)
             found = slope_of(recipe, free, named.objective, jnp.asarray(rows), offsets, recording)
@@ -96,6 +97,13 @@ def main() -> None:
                 f"{derivative / found.slope:7.2f} {found.points_differ:7.2%} {found.iterations_differ:10.1%}",
                 flush=True,
             )
+
+
+def share_of(declared: Any) -> float:
+    """Return the width of a component's range as a share of that of a positive parameter."""
+    if declared.tuned == "log":
+        return 1.0
+    return ANGLE_SHARE if declared.tuned == "turn" or declared.unit == "rad" else LENGTH_SHARE
 
 
 def slope_of(recipe: Any, free: Any, objective: Any, rows: Any, offsets: np.ndarray, recording: Any) -> Slope:
