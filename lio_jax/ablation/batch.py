@@ -22,7 +22,9 @@ def same_batch(settings: Settings) -> tuple[Any, ...]:
     offset = settings.values["extrinsics"]["time_offset"]
     estimated = settings.values["initial"].get("time_offset_sigma", 0.0) > 0
     velocity = tuple(settings.values["initial"]["velocity"])
-    return settings.recipe, settings.config, settings.run, offset, estimated, velocity
+    # lists with a number per ring may be of any length
+    shapes = tuple(leaf.shape for leaf in jax.tree.leaves(settings.params()))
+    return settings.recipe, settings.config, settings.run, offset, estimated, velocity, shapes
 
 
 def run_batch(

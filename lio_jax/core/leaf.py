@@ -46,6 +46,10 @@ class Declared:
     derivative, because it chooses points, voxels, when to stop or what to report."""
     power_of_two: bool = False
     """The value is a power of two."""
+    per_ring: bool = False
+    """The value has one number per ring of the sensor, or none at all."""
+    moves_points: bool = False
+    """The value says where the points of a scan lie, so that a derivative by it has to go through the map."""
 
     def problem(self, value: Any) -> str:
         """Return why a value is impossible ("must be ..."), or nothing if it is possible.
@@ -59,7 +63,8 @@ class Declared:
                 return f"must be a unit quaternion x y z w (its norm is {norm:.4g})"
         if self.power_of_two and (value < 2 or value & (value - 1)):
             return "must be a power of two"
-        numbers = [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
+        numbers = value if self.per_ring else [value]
+        numbers = [one for one in numbers if isinstance(one, int | float) and not isinstance(one, bool)]
         for number in numbers:
             if self.most is not None and number > self.most:
                 return f"must be at most {self.most:g}{self.why}"
@@ -82,6 +87,8 @@ def leaf(
     least: float | None = None,
     most: float | None = None,
     tuned: Tuned | None = None,
+    per_ring: bool = False,
+    moves_points: bool = False,
 ) -> Any:
     """Declare a traced parameter.
 
@@ -92,9 +99,13 @@ def leaf(
         least: inclusive lower bound.
         most: inclusive upper bound.
         tuned: how the parameter is tuned by gradient; None: it has no derivative.
+        per_ring: it has one number per ring of the sensor, or none at all.
+        moves_points: it says where the points of a scan lie.
     """
     value = default if isinstance(default, int | float) else tuple(default)
-    declared = Declared(value, unit, above, least, most, "", tuned)
+    declared = Declared(
+        value, unit, above, least, most, "", tuned, per_ring=per_ring, moves_points=moves_points
+    )
     return eqx.field(default=value, metadata={_DECLARED: declared})
 
 

@@ -20,6 +20,7 @@ from lio_jax.core.errors import UsageError
 from lio_jax.core.types import Scan
 from lio_jax.core.xla import computed_once
 from lio_jax.lidar.params import (
+    LidarParams,
     ReadsFeatures,
     ReadsLioSamFeatures,
     ReadsLoamFeatures,
@@ -294,6 +295,24 @@ def in_single_precision(
     )
     found = pick(config, params, single)
     return jax.tree.map(_cast_to(dtype), found)
+
+
+def corrected_clouds(lidar: LidarParams, features: _Features) -> _Features:
+    """Return features whose points are corrected.
+
+    The points of a mean are of one ring and near each other, so that the mean is corrected like its points.
+
+    Args:
+        lidar: the corrections.
+        features: :class:`LoamFeatures` or :class:`LioSamFeatures`.
+    """
+
+    def corrected(node: Any) -> Any:
+        if not isinstance(node, FeatureCloud):
+            return node
+        return dataclasses.replace(node, points=lidar.corrected(node.points, node.ring))
+
+    return jax.tree.map(corrected, features, is_leaf=lambda node: isinstance(node, FeatureCloud))
 
 
 def thinned_features(

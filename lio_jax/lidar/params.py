@@ -4,13 +4,18 @@ from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
 import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int32
 
 from lio_jax.core.leaf import leaf, static
 from lio_jax.core.types import Scalar
 
+_LARGEST_LIFT = 0.1
+"""Bound of a beam's error of elevation, rad; a larger number is one of degrees."""
+
 
 class LidarParams(eqx.Module):
-    """The range measurement."""
+    """The range measurement, and corrections of the sensor's own calibration."""
 
     range_sigma: Scalar = leaf(0.045, "m", above=0, tuned="log")
     """Standard deviation of a range. Where ``surface_sigma`` is zero or absent it stands for the whole
@@ -19,6 +24,62 @@ class LidarParams(eqx.Module):
     """Nearer points are dropped."""
     max_range: Scalar = leaf(100.0, "m", above=0)
     """Farther points are dropped."""
+    elevation_offset: Scalar = leaf(
+        0.0, "rad", least=-_LARGEST_LIFT, most=_LARGEST_LIFT, tuned="linear", moves_points=True
+    )
+    """Angle that is added to the elevation of each point above the sensor's xy-plane; azimuth and range
+    stay."""
+    range_offset: Scalar = leaf(0.0, "m", tuned="linear", moves_points=True)
+    """Length that is added to each range, after the scale."""
+    range_scale: Scalar = leaf(1.0, above=0, tuned="log", moves_points=True)
+    """Factor of each range."""
+    ring_elevation_offset: Float[Array, " lifted"] = leaf(
+        (), "rad", least=-_LARGEST_LIFT, most=_LARGEST_LIFT, tuned="linear", per_ring=True, moves_points=True
+    )
+    """Angle that is added to the elevation of the points of each ring as well: one number per ring, from ring
+    0 on. Rings beyond the last number have none."""
+    ring_range_offset: Float[Array, " lengthened"] = leaf(
+        (), "m", tuned="linear", per_ring=True, moves_points=True
+    )
+    """Length that is added to the ranges of each ring as well: one number per ring, from ring 0 on. Rings
+    beyond the last number have none."""
+
+    def corrected(self, points: Float[Array, "n 3"], ring: Int32[Array, " n"]) -> Float[Array, "n 3"]:
+        """Return points with these corrections of elevation and range; without any they stay as they are.
+
+        A point on the z axis has no azimuth in which to be raised: its direction stays.
+
+        Args:
+            points: m, lidar frame at each point's own firing time; finite.
+            ring: number of the ring of each point; negative where it is not known.
+        """
+        kind = points.dtype
+        lift = _of_each(self.elevation_offset, self.ring_elevation_offset, ring).astype(kind)
+        longer = _of_each(self.range_offset, self.ring_range_offset, ring).astype(kind)
+        cosine, sine = jnp.cos(lift), jnp.sin(lift)
+        x, y, z = points.T
+        level_squared = x**2 + y**2
+        level, has_azimuth = _root(level_squared)
+        distance, _ = _root(level_squared + z**2)
+        stretch = self.range_scale.astype(kind) + longer / distance
+        inward = jnp.where(has_azimuth, cosine - sine * z / level, 1.0)
+        raised = jnp.where(has_azimuth, z * cosine + sine * level, z)
+        return jnp.stack([x * inward, y * inward, raised], -1) * stretch[:, None]
+
+
+def _of_each(common: Scalar, by_ring: Float[Array, " rings"], ring: Int32[Array, " n"]) -> Array:
+    """Return the sum of a number for all points and of that for their rings, where there is one."""
+    rings = len(by_ring)
+    if not rings:
+        return common
+    known = (ring >= 0) & (ring < rings)
+    return common + jnp.where(known, by_ring[jnp.clip(ring, 0, rings - 1)], 0.0)
+
+
+def _root(squared: Float[Array, " n"]) -> tuple[Array, Array]:
+    """Return the root, or 1 with a derivative of zero where there is none, and whether there is one."""
+    positive = squared > 0
+    return jnp.sqrt(jnp.where(positive, squared, 1.0)), positive
 
 
 class BeamParams(LidarParams):

@@ -75,7 +75,7 @@ class ThinnedScan(eqx.Module):
     """A scan's points for the map, and which of them are matched against it."""
 
     points: Float[Array, "m 3"]
-    """Coordinates in the lidar frame at the firing time of each point, m."""
+    """Corrected coordinates in the lidar frame at the firing time of each point, m."""
     time: Float[Array, " m"]
     """Firing time from the scan's start, s."""
     mask: Bool[Array, " m"]
@@ -96,8 +96,10 @@ def thinned(
 ) -> ThinnedScan:
     """Return the scan within its range limits, thinned to the spacings of map and registration.
 
+    The points are chosen as they were measured, and then corrected.
+
     Args:
-        lidar: ``min_range`` and ``max_range``.
+        lidar: ``min_range`` and ``max_range``, and the corrections of the points.
         scan: padded sweep.
         map_spacing: edge of the voxels from which one point enters the map, m.
         registration_spacing: edge of the voxels from which one point is matched, m.
@@ -112,7 +114,11 @@ def thinned(
     points = jnp.where(chosen.mask[:, None], scan.points[chosen.index], 0.0)
     matched = select_per_voxel(points, chosen.mask, registration_spacing, registration_points)
     return ThinnedScan(
-        points, scan.time[chosen.index], chosen.mask, matched, chosen.dropped + matched.dropped
+        points=lidar.corrected(points, scan.ring[chosen.index]),
+        time=scan.time[chosen.index],
+        mask=chosen.mask,
+        matched=matched,
+        dropped=chosen.dropped + matched.dropped,
     )
 
 

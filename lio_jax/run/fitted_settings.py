@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.lidar.params import RingConfig
 from lio_jax.recipes import recipe_named
-from lio_jax.settings.settings import Settings
+from lio_jax.settings.settings import Settings, declared_settings
 
 _NEAR_M, _SHARE = 10.0, 90
 """Surroundings are near if this percentage of the points is within this range, m.
@@ -134,6 +134,33 @@ def with_sensor_sizes(settings: Settings, scans: Iterable[LidarScan]) -> tuple[S
     config = dataclasses.replace(settings.config, **section)
     words = ", ".join(f"config.features.{name}={getattr(chosen, name)}" for name in open_sizes)
     return dataclasses.replace(settings, config=config), [f"Sizes by the first scans: {words}."]
+
+
+def ring_count(scans: Iterable[LidarScan]) -> int:
+    """Return the number of rings in the first scans that have points; 0 where no point has a ring."""
+    rings = islice((scan.ring for scan in scans if len(scan.points)), _SCANS_WITH_RINGS)
+    return max((int(ring.max()) + 1 for ring in rings), default=0)
+
+
+def notes_on_rings(settings: Settings, scans: Iterable[LidarScan]) -> list[str]:
+    """Return a sentence for each list with a number per ring that has not as many as the scans have rings.
+
+    Args:
+        settings: settings of a run.
+        scans: scans of the recording; the first ones are counted where there is such a list.
+    """
+    declared = declared_settings(settings.recipe)
+    paths = [path for path in declared if declared[path].declared.per_ring]
+    lengths = {path: len(settings.values[path.split(".")[1]][path.split(".")[2]]) for path in paths}
+    if not any(lengths.values()):
+        return []
+    rings = ring_count(scans)
+    return [
+        f"{path} has {length} numbers and the first scans have {rings} rings: the numbers are those of rings "
+        f"0 to {length - 1}{', the other rings have none' if length < rings else ''}."
+        for path, length in lengths.items()
+        if length not in (0, rings)
+    ]
 
 
 def _fitting(rings_of_points: list[NDArray[np.int32]], features: RingConfig) -> RingConfig:

@@ -15,7 +15,12 @@ from lio_jax.data.imu_checks import cleaned
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.imu.params import OrientedImuConfig
 from lio_jax.recipes.params import InertialConfig
-from lio_jax.run.fitted_settings import fitted_to_surroundings, with_point_order, with_sensor_sizes
+from lio_jax.run.fitted_settings import (
+    fitted_to_surroundings,
+    notes_on_rings,
+    with_point_order,
+    with_sensor_sizes,
+)
 from lio_jax.run.folder import environment, write_json
 from lio_jax.run.global_correction import GlobalCorrection
 from lio_jax.run.logs import Failures, Overflow, ScanLog, StageTimes, TrajectoryLog
@@ -35,11 +40,12 @@ def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list
     settings, fitted = fitted_to_surroundings(sequence, settings)
     settings, order = with_point_order(settings, sequence.scans())
     settings, sizes = with_sensor_sizes(settings, sequence.scans())
+    rings = notes_on_rings(settings, sequence.scans())
     unused = [
         f"config.data.{name} has no effect on a recording of the format {sequence.info.format}; leave it out."
         for name in without_effect(sequence.info.format, settings.run.data)
     ]
-    return settings, [calibration, *fitted, *order, *sizes, *unused]
+    return settings, [calibration, *fitted, *order, *sizes, *rings, *unused]
 
 
 def _calibrated(sequence: Sequence, settings: Settings) -> tuple[Settings, str]:

@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.leaf import Setting, choices, numbers_of, settings_of, traced
+from lio_jax.core.leaf import Declared, Setting, choices, numbers_of, settings_of, traced
 from lio_jax.recipes import RECIPES, AnyRecipe, full_name, recipe_named
 from lio_jax.recipes.params import RecipeConfig, RecipeParams
 from lio_jax.settings.shared import GlobalParams, RunConfig
@@ -78,7 +78,7 @@ class Settings:
             changed = dataclasses.replace(getattr(tree, section), **{name: checked})
             tree = dataclasses.replace(tree, **{section: changed})
             return dataclasses.replace(self, given=given, **{owner: tree})
-        checked = _number(value, declared.default, place)
+        checked = _number(value, declared, place)
         if problem := declared.problem(checked):
             raise UsageError(f"{place} = {value!r} {problem}.")
         values = _copied(self.values)
@@ -320,12 +320,14 @@ def _typed(value: Any, kind: Any, place: str) -> Any:
     raise UsageError(f"{place} = {value!r} must be {wanted[kind]}.")
 
 
-def _number(value: Any, default: Any, place: str) -> Any:
-    """Return ``value`` as a number or a list of as many numbers as the default has."""
-    if isinstance(default, tuple):
-        numbers = [_as_float(item) for item in value] if isinstance(value, list | tuple) else []
-        if len(numbers) != len(default) or any(number is None for number in numbers):
-            raise UsageError(f"{place} = {value!r} must be a list of {len(default)} numbers.")
+def _number(value: Any, declared: Declared, place: str) -> Any:
+    """Return ``value`` as a number or a list: of as many numbers as the default has, or one for each ring."""
+    if isinstance(declared.default, tuple):
+        length = len(declared.default)
+        numbers = [_as_float(item) for item in value] if isinstance(value, list | tuple) else None
+        if numbers is None or None in numbers or not (declared.per_ring or len(numbers) == length):
+            wanted = "with one number per ring" if declared.per_ring else f"of {length} numbers"
+            raise UsageError(f"{place} = {value!r} must be a list {wanted}.")
         return numbers
     number = _as_float(value)
     if number is None:

@@ -1,9 +1,11 @@
-"""Minimise a loss from its streaming gradient: Fisher scoring, bounded quasi-Newton, or stochastic steps.
+"""Minimise a loss from its gradient: Fisher scoring, bounded quasi-Newton, zero of the gradient, stochastic.
 
-The gradient holds the map fixed while the loss's value follows it, so the two differ a little; a line search
-on the value may stop early where scoring, which looks for the gradient's zero, does not.
+The gradient holds choices fixed, such as which points enter the map (and the whole map for likelihoods by
+noise densities), while the loss jumps with them. A line search on the value may stop early where scoring and
+:func:`stationary`, which look for the gradient's zero, do not.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -32,6 +34,10 @@ class Bounds(NamedTuple):
 
     lower: Vector
     upper: Vector
+
+    def unit(self) -> Vector:
+        """Return what counts as one unit of each component: a factor e of a bound that is a factor 1000."""
+        return np.asarray((self.upper - self.lower) / 2 / math.log(1000.0), np.float64)
 
     def clip(self, x: Vector) -> Vector:
         """Return the nearest vector inside."""
@@ -73,6 +79,7 @@ def fisher_information(result: Evaluated) -> NDArray[np.float64]:
     About their mean: what all scans ask for alike, the gradient, tells nothing of the curvature. Scans that
     did not count have no score, not one of zero.
     """
+    assert result.scores is not None, "scoring needs the scans' scores"
     scores = result.scores[np.any(result.scores != 0, axis=1)]
     away = scores - np.sum(scores, axis=0) / max(len(scores), 1)
     information = away.T @ away
@@ -97,6 +104,48 @@ def lbfgsb(evaluate: Evaluate, x: Vector, bounds: Bounds, iterations: int) -> No
         tol=1e-6,
     )
     solver.run(jnp.asarray(x), bounds=(jnp.asarray(bounds.lower), jnp.asarray(bounds.upper)))
+
+
+_FIRST_STEP, _LONGEST_STEP, _SHORTEST_STEP = 0.25, 1.0, 0.01
+"""Lengths of steps of :func:`stationary` in units of :meth:`Bounds.unit`."""
+
+
+def stationary(evaluate: Evaluate, x: Vector, bounds: Bounds, iterations: int) -> None:
+    """Go to where the gradient vanishes, by quasi-Newton steps that never look at the value.
+
+    For losses that jump with choices which the gradient holds, so that their values have many small minima
+    and their gradients point the right way (Wilke, Kok, Snyman & Groenwold, "Gradient-only approaches to
+    avoid spurious local minima in unconstrained optimization", 2013). A step is taken unless the slope along
+    it comes out larger than before with the other sign. Ends where two steps in a row are short: the first
+    one may have been short because the curvature was that of a place far away.
+    """
+    unit, identity = bounds.unit(), np.eye(len(x))
+    gradient = evaluate(x).gradient * unit
+    inverse: Vector | None = None
+    short = False
+    for _ in range(iterations - 1):
+        norm = float(np.linalg.norm(gradient))
+        if inverse is None:
+            step = -gradient * (_FIRST_STEP / max(norm, np.finfo(float).tiny))
+        else:
+            step = -inverse @ gradient
+        step *= min(1.0, _LONGEST_STEP / max(float(np.linalg.norm(step)), np.finfo(float).tiny))
+        step = (bounds.clip(x + unit * step) - x) / unit
+        was_short, short = short, bool(np.linalg.norm(step) < _SHORTEST_STEP)
+        if (short and was_short) or not step.any():
+            return
+        there = evaluate(x + unit * step).gradient * unit
+        change = there - gradient
+        curvature = float(step @ change)
+        if curvature > 0:
+            if inverse is None:
+                inverse = identity * curvature / float(change @ change)
+            left = identity - np.outer(step, change) / curvature
+            inverse = left @ inverse @ left.T + np.outer(step, step) / curvature
+        elif inverse is not None:
+            inverse = 2 * inverse
+        if step @ there <= abs(step @ gradient):
+            x, gradient = x + unit * step, there
 
 
 def adam(segments: Iterator[Evaluate], x: Vector, bounds: Bounds, iterations: int, rate: float = 0.1) -> None:

@@ -1,5 +1,6 @@
 """The parameters that are tuned, as one vector: positive ones by their logarithm."""
 
+from collections.abc import Callable
 from fnmatch import fnmatchcase
 from functools import partial
 from typing import Any
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.leaf import Tuned, settings_of
+from lio_jax.core.leaf import Declared, Tuned, settings_of
 from lio_jax.recipes.params import RecipeParams
 from lio_jax.recipes.transforms import Dual
 
@@ -21,7 +22,8 @@ from lio_jax.recipes.transforms import Dual
 class ParameterVector(eqx.Module):
     """Parameters as a function of a vector x of P numbers.
 
-    A positive leaf is exp(x); translation and time offset are x; a rotation is its start times Exp(x), rad.
+    A positive leaf is exp(x); lengths, angles and times that may be negative are x; a rotation is its start
+    times Exp(x), rad.
     """
 
     start: RecipeParams
@@ -31,8 +33,17 @@ class ParameterVector(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the P components' names: ``imu.gyro_noise``, ``extrinsics.translation.x``."""
+        """Return the P components' names.
+
+        Such as ``imu.gyro_noise``, ``extrinsics.translation.x`` or ``lidar.ring_range_offset.17``.
+        """
         return tuple(name for path in self.paths for name in _component_names(self.start, path))
+
+    @property
+    def declared(self) -> tuple[Declared, ...]:
+        """Return the declaration of each of the P components."""
+        leaves = settings_of(type(self.start))
+        return tuple(leaves[path].declared for path in self.paths for _ in _component_names(self.start, path))
 
     def first(self) -> Float[Array, " p"]:
         """Return the vector of the start."""
@@ -68,17 +79,23 @@ class ParameterVector(eqx.Module):
         return {f"params.{path}": np.asarray(_leaf(params, path)).tolist() for path in self.paths}
 
 
-def free_parameters(start: RecipeParams, patterns: tuple[str, ...] | list[str]) -> ParameterVector:
+def free_parameters(
+    start: RecipeParams, patterns: tuple[str, ...] | list[str], rings: Callable[[], int] | None = None
+) -> ParameterVector:
     """Return the parameters that the patterns name.
+
+    A leaf with a number per ring that has none starts at zero for each ring, where a pattern names such
+    leaves alone.
 
     Args:
         start: values to start from.
         patterns: paths with or without the leading ``params.``, or globs such as ``imu.*_noise``: of those,
             the leaves that have a derivative.
+        rings: returns the number of the recording's rings; None: it is not known.
 
     Raises:
-        UsageError: a pattern names no leaf, or only leaves without a derivative, or a leaf to be tuned on a
-            log scale starts at zero.
+        UsageError: a pattern names no leaf, or only leaves without a derivative, a leaf to be tuned on a
+            log scale starts at zero, or the rings of a leaf are not known.
     """
     leaves = settings_of(type(start))
     smooth_ones = [path for path, leaf in leaves.items() if leaf.declared.tuned]
@@ -94,7 +111,14 @@ def free_parameters(start: RecipeParams, patterns: tuple[str, ...] | list[str]) 
                 f"'{pattern}' has no derivative, because it only chooses (points, voxels, when to stop); "
                 f"{_choice(smooth_ones)}"
             )
+        if rings is not None and all(_has_no_rings(start, leaf) for leaf in smooth):
+            start = _with_zeros(start, smooth, rings())
         starting = [leaf for leaf in smooth if _may_start(start, leaf)]
+        if not starting and _has_no_rings(start, smooth[0]):
+            raise UsageError(
+                f"'{smooth[0]}' has no number for any ring; give a start for each ring with "
+                f"--set params.{smooth[0]}=[0, 0, ...]."
+            )
         if not starting:
             raise UsageError(
                 f"'{smooth[0]}' is 0 and would be tuned on a log scale; give it a positive start with "
@@ -111,7 +135,19 @@ def _choice(paths: list[str]) -> str:
 
 
 def _may_start(start: RecipeParams, path: str) -> bool:
-    return _tuned(start, path) != "log" or bool(_leaf(start, path) > 0)
+    value = _leaf(start, path)
+    return value.size > 0 and (_tuned(start, path) != "log" or bool(value > 0))
+
+
+def _has_no_rings(start: RecipeParams, path: str) -> bool:
+    return settings_of(type(start))[path].declared.per_ring and not _leaf(start, path).size
+
+
+def _with_zeros(start: RecipeParams, paths: list[str], count: int) -> RecipeParams:
+    def leaves(params: RecipeParams) -> list[Array]:
+        return [_leaf(params, path) for path in paths]
+
+    return eqx.tree_at(leaves, start, [jnp.zeros(count, value.dtype) for value in leaves(start)])
 
 
 def _tuned(start: RecipeParams, path: str) -> Tuned | None:
@@ -124,6 +160,8 @@ def _leaf(params: RecipeParams, path: str) -> Array:
 
 
 def _component_names(start: RecipeParams, path: str) -> tuple[str, ...]:
+    if settings_of(type(start))[path].declared.per_ring:
+        return tuple(f"{path}.{ring}" for ring in range(len(_leaf(start, path))))
     if _leaf(start, path).ndim:
         return tuple(f"{path}.{axis}" for axis in "xyz")
     return (path,)

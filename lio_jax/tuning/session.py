@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import atomic_path
 from lio_jax.tuning.gradient import Evaluated, Loss
-from lio_jax.tuning.optimise import Bounds, adam, fisher_information, fisher_scoring, lbfgsb
+from lio_jax.tuning.optimise import Bounds, adam, fisher_information, fisher_scoring, lbfgsb, stationary
 from lio_jax.tuning.parameters import ParameterVector
 from lio_jax.tuning.recording import Recording
 
@@ -82,24 +82,34 @@ class Session:
         self._free, self._loss = free, loss
         self._training, self._validation = training, validation
         self._likelihood, self._patience, self._observer = likelihood, patience, observer
+        self._unit: NDArray[np.float64] | None = None
         self.history: list[Iterate] = _read(self._path, free) if self._path.exists() else []
 
     @property
     def best(self) -> Iterate:
-        """Return the iterate with the lowest loss, on the validation recordings where there are any."""
-        finite = [iterate for iterate in self.history if math.isfinite(iterate.judged)]
-        return min(finite, key=lambda iterate: iterate.judged)
+        """Return the iterate with the lowest loss, on the validation recordings where there are any.
+
+        Where there are none and the optimiser looks for the zero of the gradient: with the smallest gradient.
+        """
+        finite = [iterate for iterate in self.history if math.isfinite(self._rank(iterate))]
+        return min(finite, key=self._rank)
+
+    def _rank(self, iterate: Iterate) -> float:
+        if self._unit is None or iterate.validation is not None:
+            return iterate.judged
+        return float(np.linalg.norm(iterate.gradient * self._unit))
 
     def run(self, optimiser: str, x: NDArray[np.float64], bounds: Bounds, iterations: int, seed: int) -> None:
         """Minimise from ``x``, or from the last iterate of an earlier, interrupted tuning.
 
         Args:
-            optimiser: scoring, lbfgsb or adam.
+            optimiser: scoring, lbfgsb, stationary or adam.
             x: where to start.
             bounds: of the vector.
             iterations: at most, those of the history included.
             seed: of the segments that adam draws.
         """
+        self._unit = bounds.unit() if optimiser == "stationary" else None
         start = np.asarray(self.history[-1].x) if self.history else x
         left = iterations - len(self.history)
         if left <= 0:
@@ -107,6 +117,8 @@ class Session:
         try:
             if optimiser == "scoring":
                 fisher_scoring(self.evaluate, start, bounds, left)
+            elif optimiser == "stationary":
+                stationary(self.evaluate, start, bounds, left)
             elif optimiser == "lbfgsb":
                 lbfgsb(self.evaluate, start, bounds, left)
             else:

@@ -5,7 +5,12 @@ import pytest
 
 from lio_jax.data.sequence import LidarScan
 from lio_jax.lidar.params import LoamRingConfig
-from lio_jax.run.fitted_settings import with_point_order, with_sensor_sizes
+from lio_jax.run.fitted_settings import (
+    notes_on_rings,
+    ring_count,
+    with_point_order,
+    with_sensor_sizes,
+)
 from lio_jax.settings.settings import recipe_settings, with_overrides
 
 LOAM = recipe_settings("loam")
@@ -92,3 +97,21 @@ def test_points_in_no_order_at_all_go_by_azimuth():
     turning = lines(np.linspace(-np.pi, np.pi, 900), shuffled=True)
     untimed = LidarScan(0, turning.points, np.zeros_like(turning.time), turning.ring, turning.time, 0.0)
     assert order_of(LIO_SAM, untimed, scan(0, 0)) == ("azimuth", [])
+
+
+def test_lists_with_a_number_per_ring_should_fit_the_rings_of_the_scans():
+    short, long, fitting = (
+        with_overrides(LOAM, [f"params.lidar.ring_range_offset={[0.01] * length}"]) for length in (3, 32, 16)
+    )
+    scans = [scan(0, 0), scan(12, 100), scan(16, 100)]
+    assert ring_count(scans) == 16
+    (sentence,) = notes_on_rings(short, scans)
+    assert sentence == (
+        "params.lidar.ring_range_offset has 3 numbers and the first scans have 16 rings: "
+        "the numbers are those of rings 0 to 2, the other rings have none."
+    )
+    (sentence,) = notes_on_rings(long, scans)
+    assert sentence.endswith(
+        "32 numbers and the first scans have 16 rings: the numbers are those of rings 0 to 31."
+    )
+    assert notes_on_rings(fitting, scans) == notes_on_rings(LOAM, scans) == []

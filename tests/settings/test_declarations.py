@@ -42,11 +42,10 @@ def test_numbers_and_arrays_are_the_same_values(recipe):
 def test_each_value_reaches_the_leaf_of_its_name(path):
     section, name = path.split(".")
     values = copy.deepcopy(DEFAULTS)
-    wanted = (
-        [0.375 + i for i in range(len(values[section][name]))]
-        if isinstance(values[section][name], list)
-        else 0.375
-    )
+    length = 2 if settings_of(Params)[path].declared.per_ring else None
+    if isinstance(values[section][name], list):
+        length = length or len(values[section][name])
+    wanted = 0.375 if length is None else [0.375 + i for i in range(length)]
     values[section][name] = wanted
     params = params_from_values(values)
     np.testing.assert_array_equal(getattr(getattr(params, section), name), wanted)
@@ -79,7 +78,12 @@ def test_default_is_possible(path):
 
 @pytest.mark.parametrize(
     "path",
-    [path for path in PATHS if not path.startswith(("extrinsics", "gps.lever_arm", "initial.velocity"))],
+    [
+        path
+        for path in PATHS
+        if not path.startswith(("extrinsics", "gps.lever_arm", "initial.velocity"))
+        and not path.endswith(("elevation_offset", "range_offset"))
+    ],
 )
 def test_negative_is_impossible(path):
     assert "must" in problem(path, -0.1)
@@ -99,6 +103,14 @@ def test_zero_is_impossible_where_it_divides(path):
 def test_fraction_is_at_most_one(path):
     assert problem(path, 1.0) == ""
     assert problem(path, 1.01) == "must be at most 1"
+
+
+def test_an_elevation_offset_is_no_number_of_degrees():
+    assert problem("lidar.elevation_offset", 0.00358) == ""
+    assert problem("lidar.elevation_offset", -0.00358) == ""
+    assert problem("lidar.elevation_offset", 0.205) == "must be at most 0.1"
+    assert problem("lidar.ring_elevation_offset", [0.001, -0.2]) == "must be at least -0.1"
+    assert problem("lidar.ring_elevation_offset", []) == ""
 
 
 def test_quaternion_has_unit_norm():

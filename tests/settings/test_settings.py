@@ -55,6 +55,10 @@ def values_for(path: str) -> st.SearchStrategy:
         return st.integers(0, 2**32 - 1).map(lambda seed: Rotation.random(rng=seed).as_quat().tolist())
     if path in ("params.extrinsics.translation", "params.gps.lever_arm", "params.initial.velocity"):
         return st.lists(st.floats(-100, 100), min_size=3, max_size=3)
+    if path in PARAMS and DECLARED[path].declared.per_ring:
+        return st.lists(st.floats(-0.1, 0.1), max_size=5)
+    if path == "params.lidar.elevation_offset":
+        return st.floats(-0.1, 0.1)
     if path in PARAMS:
         return st.floats(1e-6, 1.0) if path != "params.lidar.max_range" else st.floats(3.0, 500.0)
     kind = DECLARED[path].type

@@ -74,6 +74,10 @@ WRONG_TYPE = [
     ("params.extrinsics.translation", [1.0, 2.0], "a list of 3 numbers"),
     ("params.extrinsics.translation", [1.0, 2.0, "x"], "a list of 3 numbers"),
     ("params.extrinsics.rotation", [0, 0, 1], "a list of 4 numbers"),
+    ("params.lidar.ring_range_offset", 0.1, "a list with one number per ring"),
+    ("params.lidar.ring_range_offset", [0.1, "x"], "a list with one number per ring"),
+    ("params.lidar.ring_elevation_offset", [0.001, 0.2], "at most 0.1"),
+    ("params.lidar.elevation_offset", 0.205, "at most 0.1"),
 ]
 
 

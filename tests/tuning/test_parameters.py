@@ -6,8 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import UsageError
+from lio_jax.core.leaf import traced
 from lio_jax.tuning.parameters import free_parameters
-from tests.params import default_params
+from tests.params import DEFAULTS, Params, default_params
 
 
 def test_positive_parameters_are_logarithms_and_the_rest_stays():
@@ -49,4 +50,36 @@ def test_what_cannot_be_tuned_is_reported_in_one_sentence(patterns, words):
 
 def test_a_glob_takes_what_it_can():
     free = free_parameters(default_params(), ["lidar.*", "registration.*"])
-    assert free.paths == ("lidar.range_sigma", "registration.information_scale", "registration.kernel")
+    # corrections of each ring only where they are asked for, or have numbers
+    assert free.paths == (
+        "lidar.range_sigma",
+        "lidar.elevation_offset",
+        "lidar.range_offset",
+        "lidar.range_scale",
+        "registration.information_scale",
+        "registration.kernel",
+    )
+
+
+@pytest.mark.parametrize("pattern", ["lidar.ring_elevation_offset", "lidar.ring_*"])
+def test_corrections_of_each_ring_start_at_zero_for_each_ring(pattern):
+    free = free_parameters(default_params(), ["lidar.elevation_offset", pattern], lambda: 4)
+    names = [f"lidar.ring_elevation_offset.{ring}" for ring in range(4)]
+    assert free.names[:5] == ("lidar.elevation_offset", *names)
+    if pattern.endswith("*"):
+        assert free.names[5:] == tuple(f"lidar.ring_range_offset.{ring}" for ring in range(4))
+    np.testing.assert_array_equal(free.first(), np.zeros(len(free.names)))
+    x = np.arange(len(free.names)) * 1e-3
+    assert free.overrides(x)["params.lidar.ring_elevation_offset"] == pytest.approx([1e-3, 2e-3, 3e-3, 4e-3])
+    assert {one.unit for one in free.declared[:5]} == {"rad"}
+
+
+def test_corrections_of_rings_that_are_not_known_need_a_start():
+    with pytest.raises(UsageError) as raised:
+        free_parameters(default_params(), ["lidar.ring_range_offset"])
+    assert "--set params.lidar.ring_range_offset=[0, 0, ...]" in str(raised.value)
+    with pytest.raises(UsageError):
+        free_parameters(default_params(), ["lidar.ring_range_offset"], lambda: 0)
+    given = traced(Params, {**DEFAULTS, "lidar": {**DEFAULTS["lidar"], "ring_range_offset": [0.01, 0.02]}})
+    free = free_parameters(given, ["lidar.ring_range_offset"], lambda: 16)
+    np.testing.assert_allclose(free.first(), [0.01, 0.02])
