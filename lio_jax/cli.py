@@ -254,7 +254,7 @@ def tune(
     params_from: ParamsFrom = None,
     validate: Annotated[tuple[Path, ...], arg(metavar="DATA ...")] = (),
     gt: Annotated[Path | None, arg(metavar="FILE")] = None,
-    optimizer: Literal["auto", "scoring", "lbfgsb", "adam"] = "auto",
+    optimizer: Literal["auto", "scoring", "lbfgsb", "stationary", "adam"] = "auto",
     iterations: Annotated[int, arg(metavar="N")] = 40,
     patience: Annotated[int, arg(metavar="N")] = 10,
     start: Annotated[int, arg(metavar="N")] = 0,
@@ -272,7 +272,8 @@ def tune(
         recipe: Recipe or settings file to start from; None as for run.
         validate: Recordings that decide which iterate is taken and when to stop.
         gt: Ground truth of T_world_imu; None means the recordings' own.
-        optimizer: auto takes scoring for likelihoods and lbfgsb for the others; adam steps on segments.
+        optimizer: auto takes scoring for likelihoods, stationary for extrinsics and corrections of points,
+            lbfgsb for the others; adam steps on segments.
         iterations: Largest number of evaluations.
         patience: Number of evaluations without a better one after which the tuning ends.
         start: First scan.

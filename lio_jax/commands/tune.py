@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,8 +16,9 @@ from lio_jax.commands.runtime import say
 from lio_jax.core.errors import UsageError
 from lio_jax.core.files import atomic_path
 from lio_jax.data.detect import open_sequence
+from lio_jax.run.fitted_settings import ring_count
 from lio_jax.run.run import settings_for
-from lio_jax.settings.settings import Settings, recipe_of
+from lio_jax.settings.settings import Settings
 from lio_jax.tuning.gradient import Loss, wants_map
 from lio_jax.tuning.objective_names import LIKELIHOODS, SHORT
 from lio_jax.tuning.objectives import Named, objective_named
@@ -25,12 +27,21 @@ from lio_jax.tuning.parameters import ParameterVector, free_parameters
 from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.session import HISTORY, Iterate, Session
 
-Optimiser = Literal["auto", "scoring", "lbfgsb", "adam"]
+Optimiser = Literal["auto", "scoring", "lbfgsb", "stationary", "adam"]
 
 FACTOR = 1000.0
 """Largest change of a positive parameter from its start, as a factor."""
-TURN, SHIFT, LAG = math.radians(20), 0.5, 0.1
-"""Largest change of the extrinsics from their start, rotation (rad), translation (m), and of the lag (s)."""
+REACH = {
+    "rotation": math.radians(20),
+    "translation": 0.5,
+    "time_offset": 0.1,
+    "elevation_offset": 0.05,
+    "ring_elevation_offset": 0.05,
+    "range_offset": 0.5,
+    "ring_range_offset": 0.5,
+    "range_scale": math.log(1.2),
+}
+"""Largest change of parameters that move the points, from their start: rad, m, s, and of a logarithm."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +75,6 @@ def tune(
     _check(options, data, gt)
     named = objective_named(options.objective)
     optimiser = options.optimiser
-    if optimiser == "auto":
-        optimiser = "scoring" if named.likelihood else "lbfgsb"
     if optimiser == "scoring" and not named.likelihood:
         raise UsageError(
             f"--optimizer scoring wants a likelihood ({', '.join([*SHORT, *LIKELIHOODS])}), "
@@ -73,22 +82,21 @@ def tune(
         )
     base = resolve_settings(options.recipe, options.assignments, options.params_from)
     patterns = [word.strip() for word in options.params.split(",") if word.strip()]
-    free_parameters(base.params(), patterns)
+    rings = partial(_rings_of, data[0], base)
+    free_parameters(base.params(), patterns, rings)
     settings, training = _recordings(data, base, gt, named, options, options.segment)
     _, validation = _recordings(validate, settings, None, named, replace(options, start=0, scans=None), None)
-    free = free_parameters(settings.params(), patterns)
+    free = free_parameters(settings.params(), patterns, rings)
     _prepare(out, options.overwrite)
-    wanted = wants_map(named, free)
-    through_map = wanted and recipe_of(settings).map_varies
-    if wanted and not through_map:
-        say(
-            f"note: {settings.recipe} takes its map as a constant of the derivative, which is wrong "
-            "for trajectory errors, the objective map and extrinsics; the recipe default does not."
-        )
+    through_map = wants_map(named, free)
+    if optimiser == "auto":
+        # where points lie changes a loss by little, and every value of it changes choices
+        moved = through_map and all(declared.moves_points for declared in free.declared)
+        optimiser = "scoring" if named.likelihood else "stationary" if moved else "lbfgsb"
     session = Session(
         out,
         free,
-        Loss(settings.recipe, settings.config, free, named.objective, through_map),
+        Loss(settings.recipe, settings.config, free, named.objective, through_map, named.likelihood),
         training,
         validation,
         named.likelihood,
@@ -151,9 +159,12 @@ def _recordings(
     return settings, recordings
 
 
+def _rings_of(path: Path, settings: Settings) -> int:
+    return ring_count(open_sequence(path, settings.run.data).scans())
+
+
 def _bounds(free: ParameterVector, first: np.ndarray) -> Bounds:
-    reach = {"rotation": TURN, "translation": SHIFT, "time_offset": LAG}
-    width = np.array([reach.get(name.split(".")[1], math.log(FACTOR)) for name in free.names])
+    width = np.array([REACH.get(name.split(".")[1], math.log(FACTOR)) for name in free.names])
     upper = first + width
     for place, name in enumerate(free.names):
         if name == "registration.information_scale":
@@ -196,8 +207,8 @@ def _report(free: ParameterVector, iterate: Iterate) -> None:
 def _shown(free: ParameterVector, iterate: Iterate) -> dict[str, float]:
     """Return the components in their own units: exp of the components on a log scale."""
     return {
-        name: value if name.startswith("extrinsics.") else math.exp(value)
-        for name, value in zip(free.names, iterate.x, strict=True)
+        name: math.exp(value) if declared.tuned == "log" else value
+        for name, declared, value in zip(free.names, free.declared, iterate.x, strict=True)
     }
 
 
@@ -206,10 +217,12 @@ def _interval(free: ParameterVector, iterate: Iterate) -> dict[str, tuple[float,
     if iterate.sigma is None:
         return {}
     intervals = {}
-    for name, value, sigma in zip(free.names, iterate.x, iterate.sigma, strict=True):
+    components = zip(free.names, free.declared, iterate.x, iterate.sigma, strict=True)
+    for name, declared, value, sigma in components:
         ends = (value - 1.96 * sigma, value + 1.96 * sigma)
-        plain = name.startswith("extrinsics.")
-        intervals[name] = ends if plain else (math.exp(max(ends[0], -700)), math.exp(min(ends[1], 700)))
+        if declared.tuned == "log":
+            ends = (math.exp(max(ends[0], -700)), math.exp(min(ends[1], 700)))
+        intervals[name] = ends
     return intervals
 
 

@@ -91,6 +91,50 @@ def eigenvalues_and_normal3(
     return mean[..., None] + p[..., None] * values, normal
 
 
+def normal_slope3(
+    matrix: Float[Array, "k 3 3"], normal: Float[Array, "k 3"], change: Float[Array, "k 3 3"]
+) -> tuple[Float[Array, "k 3"], Float[Array, "k 2"]]:
+    """Return how the eigenvector of the smallest eigenvalue and the two smaller eigenvalues change.
+
+    With A n = l n, a change dA turns the eigenvector by -(A - l I)^+ dA n and changes the eigenvalue of v by
+    v' dA v (Magnus, "On differentiating eigenvalues and eigenvectors", 1985). In the inverse, a gap g between
+    eigenvalues becomes (g^2 + e^2) / g with a tiny e, because the eigenvector is undefined where two of them
+    meet.
+
+    Args:
+        matrix: symmetric, such as covariances in m^2.
+        normal: unit eigenvectors of the smallest eigenvalues.
+        change: symmetric.
+    """
+    basis = jnp.stack(across(normal), -1)
+
+    def within(between: Array, left: Array, right: Array) -> Array:
+        return jnp.einsum("kia,kij,kjb->kab", left, between, right)
+
+    n = normal[:, :, None]
+    smallest, change_of_smallest = within(matrix, n, n)[:, 0, 0], within(change, n, n)[:, 0, 0]
+    M, dM = within(matrix, basis, basis), within(change, basis, basis)
+    half, mixed = (M[:, 0, 0] - M[:, 1, 1]) / 2, M[:, 0, 1]
+    radius = jnp.sqrt(jnp.maximum(half**2 + mixed**2, 1e-30))
+    change_of_radius = (half * (dM[:, 0, 0] - dM[:, 1, 1]) / 2 + mixed * dM[:, 0, 1]) / radius
+    change_of_middle = (dM[:, 0, 0] + dM[:, 1, 1]) / 2 - change_of_radius
+
+    middle = (M[:, 0, 0] + M[:, 1, 1]) / 2 - smallest
+    least = _LEAST_GAP * jnp.abs(M[:, 0, 0] + M[:, 1, 1]) + _LEAST_VARIANCE
+    low, high = (gap / (gap**2 + least**2) for gap in (middle - radius, middle + radius))
+    mean_inverse = (low + high) / 2
+    cosine, sine = ((high - low) / 2 * side / radius for side in (half, mixed))
+    c, d = within(change, basis, n)[:, :, 0].T
+    turn = jnp.stack([mean_inverse * c + cosine * c + sine * d, mean_inverse * d + sine * c - cosine * d], -1)
+    return -jnp.einsum("kia,ka->ki", basis, turn), jnp.stack([change_of_smallest, change_of_middle], -1)
+
+
+_LEAST_GAP = 1e-6
+"""Share of the larger eigenvalues below which the gap between the two smaller ones counts as none."""
+_LEAST_VARIANCE = 1e-9
+"""The same for all eigenvalues, m^2: points may coincide."""
+
+
 def across(axis: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
     """Return two unit vectors that are perpendicular to a unit vector and to each other.
 

@@ -3,14 +3,25 @@
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.keyframes import KeyframeCloud, Keyframes, next_to_enter, with_keyframe
 from lio_jax.mapping.params import CubeGridParams, CubeParams, FeatureMapParams, PointMapParams, SubmapParams
-from lio_jax.mapping.point_map import EDGE, PointInsertion, PointMap, empty_map, insert, move_cube, shift_box
+from lio_jax.mapping.point_map import (
+    EDGE,
+    PointInsertion,
+    PointMap,
+    empty_map,
+    following,
+    insert,
+    move_cube,
+    shift_box,
+)
 from lio_jax.mapping.voxel_map import anchor_of
 
 
@@ -34,6 +45,10 @@ class FeatureMap(eqx.Module):
     corner: PointMap
     surface: PointMap
 
+    def varying(self) -> "FeatureMap":
+        """Return a tree of booleans: the points of both kinds have a derivative."""
+        return FeatureMap(self.corner.varying(), self.surface.varying())
+
 
 class Frames(eqx.Module):
     """The frames of the corners and of the surface points: their maps may have different grids."""
@@ -42,9 +57,9 @@ class Frames(eqx.Module):
     surface: Frame
 
 
-def empty_feature_map(capacity: int) -> FeatureMap:
+def empty_feature_map(capacity: int, dtype: DTypeLike = jnp.float32) -> FeatureMap:
     """Return a map with ``capacity`` free blocks of either kind, its boxes around the world's origin."""
-    return FeatureMap(empty_map(capacity), empty_map(capacity))
+    return FeatureMap(empty_map(capacity, dtype), empty_map(capacity, dtype))
 
 
 def frames_at(position: Float[Array, "3"], map_params: FeatureMapParams) -> Frames:
@@ -85,16 +100,18 @@ def added_to(
         point_map: for ``nearer_by``.
         half_sides: half the edges of the box outside of which nothing is kept, m.
         follow: moves that box.
+
+    The points of the map follow those that were added, if these have a derivative.
     """
     kinds = (
         (feature_map.corner, points.corner, points.corner_mask, frames.corner, map_params.corner_voxel_size),
         (feature_map.surface, points.surface, points.surface_mask, frames.surface, map_params.voxel_size),
     )
     maps, insertions = [], []
-    for pmap, placed, mask, frame, size in kinds:
+    for before, placed, mask, frame, size in kinds:
         block = EDGE * size
-        pmap, insertion = insert(
-            pmap,
+        inserted, insertion = insert(
+            before,
             placed,
             mask & keep,
             frame.anchor,
@@ -103,7 +120,9 @@ def added_to(
             point_map.nearer_by.astype(jnp.float32),
         )
         # last: XLA copies the map if another operation reads it afterwards
-        maps.append(follow(pmap, frame, block))
+        moved = follow(inserted, frame, block)
+        added = insertion.added
+        maps.append(following(moved, before, inserted, added, placed, frame.anchor, size))
         insertions.append(insertion)
     return FeatureMap(*maps), insertions[0], insertions[1]
 
@@ -165,6 +184,12 @@ class Submap(eqx.Module):
     features: FeatureMap
     """Map of the points of the keyframes around the vehicle."""
 
+    def varying(self) -> "Submap":
+        """Return a tree of booleans: the keyframes' poses and the map's points have a derivative."""
+        fixed = jax.tree.map(lambda _: False, self.keyframes)
+        keyframes = eqx.tree_at(lambda some: some.T_world_lidar.wxyz_xyz, fixed, True)
+        return Submap(keyframes, self.features.varying())
+
 
 def with_scan(
     submap: Submap,
@@ -192,7 +217,8 @@ def with_scan(
         The submap, the frames of its points near the scan, the scan's points in them, and what was added of
         either kind: the scan's points first.
     """
-    single = [kind.astype(jnp.float32) for kind in (points.corner, points.surface)]
+    # a keyframe that enters anew moves with its pose alone
+    single = [jax.lax.stop_gradient(kind).astype(jnp.float32) for kind in (points.corner, points.surface)]
     cloud = KeyframeCloud(single[0], points.corner_mask, single[1], points.surface_mask)
     keyframes = with_keyframe(submap.keyframes, keep, T_world_lidar, time, cloud, settings)
     keyframes, T_world_back, back = next_to_enter(keyframes, T_world_lidar, time, settings)
@@ -201,9 +227,9 @@ def with_scan(
     returned = FeaturePoints(back.corner, back.corner_mask, back.surface, back.surface_mask)
     entering = placed_in(frames, returned, T_world_back)
     both = FeaturePoints(
-        corner=jnp.concatenate([placed.corner.astype(jnp.float32), entering.corner]),
+        corner=jnp.concatenate([placed.corner, entering.corner]),
         corner_mask=jnp.concatenate([placed.corner_mask & keep, entering.corner_mask]),
-        surface=jnp.concatenate([placed.surface.astype(jnp.float32), entering.surface]),
+        surface=jnp.concatenate([placed.surface, entering.surface]),
         surface_mask=jnp.concatenate([placed.surface_mask & keep, entering.surface_mask]),
     )
     half_side = point_map.cube_side_length / 2
@@ -216,4 +242,4 @@ def with_scan(
     features, *added = added_to(
         submap.features, both, jnp.array(True), frames, map_params, point_map, half_side, follow
     )
-    return Submap(keyframes, features), frames, placed, (added[0], added[1])
+    return Submap(keyframes, features), frames, jax.lax.stop_gradient(placed), (added[0], added[1])

@@ -10,7 +10,8 @@ import itertools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Float32, Int32
+from jax.typing import DTypeLike
+from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.prefix_sum import running_count
 from lio_jax.core.xla import computed_once
@@ -28,14 +29,22 @@ _WIDE_CHUNK = 128
 class Neighbours(eqx.Module):
     """The n map points nearest to each of k queries, in ascending distance; infinite if there are too few."""
 
-    x: Float32[Array, "n k"]
+    x: Float[Array, "n k"]
     """Coordinate x of each point, m, in the anchored frame."""
-    y: Float32[Array, "n k"]
+    y: Float[Array, "n k"]
     """Coordinate y of each point, m, in the anchored frame."""
-    z: Float32[Array, "n k"]
+    z: Float[Array, "n k"]
     """Coordinate z of each point, m, in the anchored frame."""
-    squared_distance: Float32[Array, "n k"]
+    squared_distance: Float[Array, "n k"]
     """Squared distance of each point from the query, m^2."""
+    entry: Int32[Array, "n k"]
+    """Where the map holds each point: its slot times 27, plus its voxel; 0 where there is none."""
+
+    @staticmethod
+    def none(neighbours: int, count: int, dtype: DTypeLike) -> "Neighbours":
+        """Return the neighbours of queries that were not searched."""
+        far = jnp.full((neighbours, count), jnp.inf, dtype)
+        return Neighbours(far, far, far, far, jnp.zeros((neighbours, count), jnp.int32))
 
 
 def nearest_points(
@@ -43,9 +52,9 @@ def nearest_points(
     points: Float[Array, "k 3"],
     mask: Bool[Array, " k"],
     anchor: Int32[Array, "3"],
-    voxel_size: Float32[Array, ""],
+    voxel_size: Float[Array, ""],
     neighbours: int,
-    radius: Float32[Array, ""] | float = jnp.inf,
+    radius: Float[Array, ""] | float = jnp.inf,
 ) -> Neighbours:
     """Return the map points nearest to each query.
 
@@ -65,10 +74,10 @@ def nearest_points(
     """
     count = points.shape[0]
     edge = EDGE * voxel_size
-    points = jnp.where(mask[:, None], points.astype(jnp.float32), 0.0)
+    points = jnp.where(mask[:, None], points.astype(pmap.point.dtype), 0.0)
     search = _Search(pmap, points, anchor, edge, neighbours)
     order = jnp.arange(count, dtype=jnp.int32)
-    found = Neighbours(*[jnp.full((neighbours, count), jnp.inf, jnp.float32)] * 4)
+    found = Neighbours.none(neighbours, count, points.dtype)
     rows = jnp.max(jnp.where(mask, order + 1, 0))
     found = search.over(found, order, rows, jnp.array(_NEAR, jnp.int32), _CHUNK)
 
@@ -86,9 +95,9 @@ class _Search(eqx.Module):
     """The map and the queries of a search."""
 
     pmap: PointMap
-    points: Float32[Array, "k 3"]
+    points: Float[Array, "k 3"]
     anchor: Int32[Array, "3"]
-    edge: Float32[Array, ""]
+    edge: Float[Array, ""]
     neighbours: int = eqx.field(static=True)
 
     def over(
@@ -110,7 +119,7 @@ class _Search(eqx.Module):
 
         return jax.lax.fori_loop(0, (rows + chunk - 1) // chunk, one_chunk, found)
 
-    def _among(self, points: Float32[Array, "c 3"], blocks: Int32[Array, "b 3"]) -> Neighbours:
+    def _among(self, points: Float[Array, "c 3"], blocks: Int32[Array, "b 3"]) -> Neighbours:
         """Return the nearest points in some blocks; 1 in ``blocks`` is a step to the query's nearer side."""
         scaled = points / self.edge
         own = jnp.floor(scaled)
@@ -129,7 +138,7 @@ class _Search(eqx.Module):
                 for axis in range(3)
             )
             squared = jnp.where(held[:, None] >= 0, squared, jnp.inf)
-            key = jax.lax.bitcast_convert_type(squared, jnp.int32) & distance_bits
+            key = jax.lax.bitcast_convert_type(squared.astype(jnp.float32), jnp.int32) & distance_bits
             # queries are contiguous in memory: the network's loops run over them
             keys = computed_once((key | (number * VOXELS + jnp.arange(VOXELS, dtype=jnp.int32))).T)
             # a copy in memory of its own: XLA does not vectorise a loop that reads its own carry
@@ -156,10 +165,28 @@ class _Search(eqx.Module):
         ]
         x, y, z = coordinates
         squared = (x - points[:, 0]) ** 2 + (y - points[:, 1]) ** 2 + (z - points[:, 2]) ** 2
-        return Neighbours(x, y, z, squared)
+        return Neighbours(x, y, z, squared, jnp.maximum(chosen, 0) * VOXELS + voxel)
 
-    def _centre(self, local: Int32[Array, "*b 3"]) -> Float32[Array, "*b 3"]:
-        return (local.astype(jnp.float32) + 0.5) * self.edge
+    def _centre(self, local: Int32[Array, "*b 3"]) -> Float[Array, "*b 3"]:
+        return (local.astype(self.points.dtype) + 0.5) * self.edge
+
+
+def coordinates_at(
+    pmap: PointMap, entry: Int32[Array, "n k"], anchor: Int32[Array, "3"], voxel_size: Float[Array, ""]
+) -> Float[Array, "3 n k"]:
+    """Return the coordinates of points that the map holds, m, in the anchored frame.
+
+    Args:
+        pmap: the map; its points may have a derivative.
+        entry: see :class:`Neighbours`.
+        anchor: block whose lower corner is the origin.
+        voxel_size: edge length of a voxel, m.
+    """
+    slot, voxel = entry // VOXELS, entry % VOXELS
+    axis = jnp.arange(3)[:, None, None]
+    local = jnp.moveaxis(_take(pmap.block, slot) - anchor, -1, 0)
+    centre = (local.astype(pmap.point.dtype) + 0.5) * (EDGE * voxel_size)
+    return _take(pmap.point, (slot[None], axis * VOXELS + voxel)) + centre
 
 
 def _with_candidate(nearest: tuple[Array, ...], key: Array) -> tuple[Array, ...]:

@@ -9,10 +9,12 @@ blocks, such that the vehicle is near the origin.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Float32, Int32
+from jax.typing import DTypeLike
+from jaxtyping import Array, Bool, Float, Int32
 
+from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.xla import computed_once
-from lio_jax.mapping.hash_slots import FREE, claim_slots, free_keys
+from lio_jax.mapping.hash_slots import FREE, claim_slots, find_slots, free_keys
 
 EDGE = 3
 """Number of voxels along an edge of a block."""
@@ -25,12 +27,17 @@ class PointMap(eqx.Module):
 
     block: Int32[Array, "c 3"]
     """Integer coordinates of the block in each slot; ``FREE`` in a free slot."""
-    point: Float32[Array, "c 81"]
+    point: Float[Array, "c 81"]
     """x of the 27 voxels' points, then y, then z, m from the block's centre; infinite in empty voxels."""
-    off_centre: Float32[Array, "c 27"]
+    off_centre: Float[Array, "c 27"]
     """Distance of each point from its voxel's centre, m; infinite in empty voxels."""
     cube: Int32[Array, "3"]
     """The block at the cube's centre."""
+
+    def varying(self) -> "PointMap":
+        """Return a tree of booleans: the points have a derivative."""
+        fixed = jax.tree.map(lambda _: False, self)
+        return eqx.tree_at(lambda one: one.point, fixed, True)
 
 
 class PointInsertion(eqx.Module):
@@ -42,22 +49,23 @@ class PointInsertion(eqx.Module):
     """Number of points whose block found no free slot, because the table is too full."""
 
 
-def empty_map(capacity: int) -> PointMap:
+def empty_map(capacity: int, dtype: DTypeLike = jnp.float32) -> PointMap:
     """Return a map of free blocks, with its cube around the world's origin.
 
     Args:
         capacity: number of blocks, a power of two.
+        dtype: of the coordinates.
     """
     return PointMap(
         block=free_keys(capacity),
-        point=jnp.full((capacity, 3 * VOXELS), jnp.inf, jnp.float32),
-        off_centre=jnp.full((capacity, VOXELS), jnp.inf, jnp.float32),
+        point=jnp.full((capacity, 3 * VOXELS), jnp.inf, dtype),
+        off_centre=jnp.full((capacity, VOXELS), jnp.inf, dtype),
         cube=jnp.zeros(3, jnp.int32),
     )
 
 
 def move_cube(
-    pmap: PointMap, anchor: Int32[Array, "3"], half_side: Float32[Array, ""], margin: Float32[Array, ""]
+    pmap: PointMap, anchor: Int32[Array, "3"], half_side: Float[Array, ""], margin: Float[Array, ""]
 ) -> PointMap:
     """Move the cube to the sensor along each axis on which a face is near, and delete the points outside.
 
@@ -74,9 +82,9 @@ def move_cube(
 def shift_box(
     pmap: PointMap,
     anchor: Int32[Array, "3"],
-    half_sides: Float32[Array, "3"],
-    margin: Float32[Array, ""],
-    step: Float32[Array, ""],
+    half_sides: Float[Array, "3"],
+    margin: Float[Array, ""],
+    step: Float[Array, ""],
 ) -> PointMap:
     """Shift a box in place of the cube, in whole steps, until no face is too near to the sensor.
 
@@ -94,7 +102,7 @@ def shift_box(
     return _cleared(pmap, centre.astype(jnp.int32), half_sides)
 
 
-def _cleared(pmap: PointMap, centre: Int32[Array, "3"], half_sides: Float32[Array, "*d"]) -> PointMap:
+def _cleared(pmap: PointMap, centre: Int32[Array, "3"], half_sides: Float[Array, "*d"]) -> PointMap:
     """Return the map with its cube or box around another block, without the blocks outside."""
 
     def cleared(_: Array, pmap: PointMap) -> PointMap:
@@ -115,9 +123,9 @@ def insert(
     points: Float[Array, "m 3"],
     mask: Bool[Array, " m"],
     anchor: Int32[Array, "3"],
-    voxel_size: Float32[Array, ""],
-    half_side: Float32[Array, "*d"],
-    nearer_by: Float32[Array, ""],
+    voxel_size: Float[Array, ""],
+    half_side: Float[Array, "*d"],
+    nearer_by: Float[Array, ""],
 ) -> tuple[PointMap, PointInsertion]:
     """Keep in each voxel the point nearest to its centre: the one that the map holds, or one of ``points``.
 
@@ -131,14 +139,11 @@ def insert(
         nearer_by: a new point replaces the old one if it is nearer to the centre by more than this, m.
     """
     capacity = pmap.block.shape[0]
-    points = points.astype(jnp.float32)
-    cell = jnp.floor(jnp.where(mask[:, None], points, 0.0) / voxel_size)
-    local = jnp.floor(cell / EDGE)
-    block = local.astype(jnp.int32) + anchor
+    pmap, points = jax.lax.stop_gradient((pmap, points.astype(pmap.point.dtype)))
+    cell, local, block = _places(points, mask, anchor, voxel_size)
     inside = mask & _inside(block, pmap.cube, half_side)
     keys, slot = computed_once(claim_slots(pmap.block, block, inside))
-    x, y, z = jnp.moveaxis((cell - EDGE * local).astype(jnp.int32), -1, 0)
-    voxel = jnp.clip((x * EDGE + y) * EDGE + z, 0, VOXELS - 1)
+    voxel = _voxel_in_block(cell, local)
     x, y, z = (points[:, axis] - (cell[:, axis] + 0.5) * voxel_size for axis in range(3))
     off_centre = jnp.sqrt(x**2 + y**2 + z**2)
     target = jnp.where(slot >= 0, slot, capacity)
@@ -156,8 +161,63 @@ def insert(
     return PointMap(keys, point, best, pmap.cube), PointInsertion(added, homeless)
 
 
+def following(
+    pmap: PointMap,
+    before: PointMap,
+    inserted: PointMap,
+    added: Bool[Array, " m"],
+    points: Float[Array, "m 3"],
+    anchor: Int32[Array, "3"],
+    voxel_size: Float[Array, ""],
+) -> PointMap:
+    """Return a map after an insertion with the derivative of its points.
+
+    Which voxel keeps which point is a choice, which the derivative holds.
+
+    Args:
+        pmap: the map after :func:`insert`, and after its cube was moved.
+        before: the map before the insertion; its points may have a derivative.
+        inserted: the map between the insertion and the move.
+        added: which of the m points are in the map.
+        points: as they were inserted, m, in the anchored frame; they may have a derivative.
+        anchor: block whose lower corner is the origin of ``points``.
+        voxel_size: edge length of a voxel, m.
+    """
+    still = jax.lax.stop_gradient(pmap)
+    choices = jax.lax.stop_gradient((inserted.block, added, points, anchor, voxel_size))
+    point = with_derivative_of(still.point, _points_after, before.point, points, choices)
+    return eqx.tree_at(lambda one: one.point, still, point)
+
+
+def _points_after(before: Float[Array, "c 81"], points: Float[Array, "m 3"], choices: tuple) -> Array:
+    """Return the points after an insertion whose choices are known, those outside of the cube included."""
+    block, added, known, anchor, voxel_size = choices
+    cell, local, key = _places(known, added, anchor, voxel_size)
+    order = jnp.arange(len(added), dtype=jnp.int32)
+    # rows of their own for what is left out: only then the derivative is written where the table lies
+    slot = jnp.where(added, find_slots(block, key), len(before) + order)
+    voxel = _voxel_in_block(cell, local)
+    offset = (points - (local + 0.5) * EDGE * voxel_size).astype(before.dtype)
+    columns = jnp.arange(3, dtype=jnp.int32)[:, None] * VOXELS + voxel
+    return before.at[slot[None], columns].set(offset.T, mode="drop", unique_indices=True)
+
+
+def _places(
+    points: Float[Array, "m 3"], mask: Bool[Array, " m"], anchor: Int32[Array, "3"], voxel_size: Array
+) -> tuple[Array, Array, Int32[Array, "m 3"]]:
+    """Return each point's voxel and block, counted from the anchor, and the block's coordinates."""
+    cell = jnp.floor(jnp.where(mask[:, None], points, 0.0) / voxel_size)
+    local = jnp.floor(cell / EDGE)
+    return cell, local, local.astype(jnp.int32) + anchor
+
+
+def _voxel_in_block(cell: Float[Array, "m 3"], local: Float[Array, "m 3"]) -> Int32[Array, " m"]:
+    x, y, z = jnp.moveaxis((cell - EDGE * local).astype(jnp.int32), -1, 0)
+    return jnp.clip((x * EDGE + y) * EDGE + z, 0, VOXELS - 1)
+
+
 def _inside(
-    block: Int32[Array, "m 3"], cube: Int32[Array, "3"], half_side: Float32[Array, "*d"]
+    block: Int32[Array, "m 3"], cube: Int32[Array, "3"], half_side: Float[Array, "*d"]
 ) -> Bool[Array, " m"]:
     """Return which blocks lie in the cube, or in the box."""
     half_sides = jnp.broadcast_to(half_side, 3)

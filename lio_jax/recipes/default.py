@@ -16,7 +16,6 @@ class Default(Recipe[DefaultConfig, DefaultParams, DefaultState]):
 
     config_type = DefaultConfig
     params_type = DefaultParams
-    map_varies = True
     # with the values for streets, voxels hold more than one wall: on 20 s of walking in a simulated office
     # the trajectory's error was 32 mm instead of 7 mm
     near_values: ClassVar[Mapping[str, float]] = {

@@ -26,7 +26,7 @@ from lio_jax.lidar.params import LidarParams, ScanConfig
 from lio_jax.lidar.thinning import mean_per_voxel
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.params import MapConfig, MapParams, MovingCubeParams
-from lio_jax.mapping.point_map import EDGE, PointMap, empty_map, insert, move_cube
+from lio_jax.mapping.point_map import EDGE, PointMap, empty_map, following, insert, move_cube
 from lio_jax.mapping.voxel_map import anchor_of
 from lio_jax.recipes import recipe
 from lio_jax.recipes.constant_velocity import (
@@ -161,6 +161,10 @@ class FastLio2State(recipe.State):
     """Time since the last scan that was matched, s."""
     map: PointMap
 
+    def varying_map(self) -> PointMap:
+        """Return which leaves of the map have a derivative: the points."""
+        return self.map.varying()
+
     def with_velocity_of(self, found: "FastLio2State") -> "FastLio2State":
         """Return this first state with the velocity of a later one, and with its angular rate."""
 
@@ -259,12 +263,12 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
             new_piece = outage.begins_piece(lost, params.registration)
             T_world_lidar = lidar_pose(posterior.nav)
         with jax.named_scope("insert"):
-            # the map is a constant of the derivative
-            _, placed = jax.lax.stop_gradient(frame.place(thin.points, T_world_lidar))
+            _, moving = frame.place(thin.points, T_world_lidar)
+            placed = jax.lax.stop_gradient(moving)
             side = params.point_map.cube_side_length
             margin = params.point_map.cube_margin * params.lidar.max_range
             in_blocks = jnp.stack([side / 2, margin]).astype(jnp.float32) / (EDGE * voxel_size)
-            cube_map, added = insert(
+            inserted, added = insert(
                 state.map,
                 placed,
                 thin.mask & (~lost | new_piece),
@@ -274,7 +278,8 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
                 params.point_map.nearer_by.astype(jnp.float32),
             )
             # last: XLA copies the map if another operation reads it afterwards
-            cube_map = move_cube(cube_map, frame.anchor, *in_blocks)
+            cube_map = move_cube(inserted, frame.anchor, *in_blocks)
+            cube_map = following(cube_map, state.map, inserted, added.added, moving, frame.anchor, voxel_size)
 
         drift = state.drift.carried(state.uncertain.nav.T_world_imu, posterior.nav.T_world_imu)
         posterior, drift = in_new_piece(posterior, drift, jnp.zeros_like(to_end), new_piece)
@@ -310,9 +315,10 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
 def _filtered(
     every: int, params: FastLio2Params, scan: Scan
 ) -> tuple[Float[Array, "n 3"], Float[Array, " n"], Bool[Array, " n"]]:
-    """Return every n-th point, its time, and whether it lies between the blind radius and the far limit."""
+    """Return every n-th point, corrected, its time, and whether it is between blind radius and far limit."""
     points, time = scan.points[::every], scan.time[::every]
     squared_range = jnp.sum(points**2, -1)
     near, far = params.lidar.min_range.astype(jnp.float32), params.lidar.max_range.astype(jnp.float32)
     mask = scan.mask[::every] & (squared_range > near**2) & (squared_range < far**2)
-    return jnp.where(mask[:, None], points, 0.0), time, mask
+    points = jnp.where(mask[:, None], points, 0.0)
+    return params.lidar.corrected(points, scan.ring[::every]), time, mask

@@ -105,8 +105,8 @@ def step(
     with jax.named_scope("predict"):
         prior, path = predicted(params, state.estimate, scan, imu, first)
         T_predicted = lidar_pose(prior.nav)
-        still = jax.lax.stop_gradient((path, prior.nav.T_imu_lidar))
-        points = deskew_along(*still, thin.points, thin.time)
+        still = jax.lax.stop_gradient((path, prior.nav.T_imu_lidar, thin.points))
+        points = deskew_along(*still, thin.time)
         to_match = _to_match(path, prior.nav.T_imu_lidar, thin, points)
         outage = Outage.at(params, state.unmatched + scan.interval, thin.matched.mask)
     with jax.named_scope("update"):

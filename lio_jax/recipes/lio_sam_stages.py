@@ -24,6 +24,7 @@ from lio_jax.imu.sampling import sample_intervals
 from lio_jax.imu.strapdown import path_along
 from lio_jax.lidar.features import (
     FeatureCloud,
+    corrected_clouds,
     in_single_precision,
     lio_sam_features,
     thinned_features,
@@ -67,6 +68,10 @@ class LioSamState(recipe.State):
     drift: MapDrift
     """Errors of the predicted poses at which pieces of the map began."""
     map: Submap
+
+    def varying_map(self) -> Submap:
+        """Return which leaves of the map have a derivative: the keyframes' poses and the points around."""
+        return self.map.varying()
 
     def with_velocity_of(self, found: "LioSamState") -> "LioSamState":
         """Return this first state with the velocity of a later one."""
@@ -118,15 +123,17 @@ class Features(eqx.Module):
 def picked_features(
     config: LioSamConfig, params: LioSamParams, scan: Scan, first: Bool[Array, ""]
 ) -> Features:
-    """Return the corners and surface points of a scan, thinned as the map is.
+    """Return the corners and surface points of a scan, corrected, and thinned as the map is.
 
     Args:
         config: ``config.features`` and the capacities ``config.lio_sam``.
-        params: ``params.features``, the voxel sizes, and ``params.submap`` for the least numbers.
+        params: ``params.features``, ``params.lidar``, the voxel sizes, and ``params.submap`` for the least
+            numbers.
         scan: padded sweep.
         first: no scan was seen before.
     """
     features = in_single_precision(lio_sam_features, config, params, scan)
+    features = corrected_clouds(params.lidar, features)
     room = config.lio_sam.corner_points, config.lio_sam.surface_points
     voxel_sizes = params.map.corner_voxel_size, params.map.voxel_size
     corner, surface, thinned_away = thinned_features(features.corner, features.surface, voxel_sizes, *room)
@@ -353,14 +360,13 @@ def keyframe(
         match: the scan's.
         failed: the smoother ran away.
     """
-    # the map is a constant of the derivative
-    T_world_lidar, still = jax.lax.stop_gradient((lidar_pose(nav), points))
+    T_world_lidar = lidar_pose(nav)
     sound = (match.used | match.new_piece) & ~failed
     sound = sound | (clock.first & features.seen)
     submap, frames, placed, added = with_scan(
         state.map,
         sound & (is_due(state.map.keyframes, T_world_lidar, params.submap) | match.new_piece),
-        still,
+        points,
         T_world_lidar,
         jax.lax.stop_gradient(clock.time),
         params.map,

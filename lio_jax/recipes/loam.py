@@ -26,6 +26,7 @@ from lio_jax.lidar.features import (
     FeatureCloud,
     LoamFeatures,
     check_sizes,
+    corrected_clouds,
     in_single_precision,
     loam_features,
     thinned_features,
@@ -110,11 +111,15 @@ class LoamConfig(RecipeConfig):
 
 
 class Targets(eqx.Module):
-    """What scans are matched with: constants of the derivative."""
+    """What scans are matched with."""
 
     cubes: FeatureMap
     last: LastScan
     """In the lidar frame of the last scan's middle."""
+
+    def varying(self) -> "Targets":
+        """Return a tree of booleans: the points have a derivative."""
+        return Targets(self.cubes.varying(), self.last.varying())
 
 
 class LoamState(recipe.State):
@@ -135,6 +140,10 @@ class LoamState(recipe.State):
     unmatched: Float[Array, ""]
     """Time since the last scan that was matched, s."""
     map: Targets
+
+    def varying_map(self) -> Targets:
+        """Return which leaves of the map have a derivative: the points of the cubes and of the last scan."""
+        return self.map.varying()
 
     def with_velocity_of(self, found: "LoamState") -> "LoamState":
         """Return this first state with the velocity of a later one."""
@@ -197,6 +206,7 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
         first = state.scans == 0
         with jax.named_scope("features"):
             features = in_single_precision(loam_features, config, params, scan)
+            features = corrected_clouds(params.lidar, features)
             enough = (
                 jnp.sum(features.sharp.mask) + jnp.sum(features.flat.mask) > params.registration.min_matches
             )
@@ -236,13 +246,13 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             new_piece = outage.begins_piece(lost, params.registration)
             T = mapping.T_world_lidar
         with jax.named_scope("insert"):
-            # the map is a constant of the derivative
-            last = _last(config, features, motion, jax.lax.stop_gradient(odometry.T_world_lidar))
+            last = _last(config, features, motion, odometry.T_world_lidar, state.map.last)
             frames = frames_at(jax.lax.stop_gradient(T.translation()), params.map)
-            placed = jax.lax.stop_gradient(placed_in(frames, thin, T))
+            moving = placed_in(frames, thin, T)
+            placed = jax.lax.stop_gradient(moving)
             cubes, *added = added_to_cubes(
                 state.map.cubes,
-                placed,
+                moving,
                 its_turn & (~lost | new_piece),
                 frames,
                 params.map,
@@ -343,10 +353,15 @@ def _mapped(
 
 
 def _last(
-    config: LoamConfig, features: LoamFeatures, motion: TrialMotion, T_last_lidar: jaxlie.SE3
+    config: LoamConfig,
+    features: LoamFeatures,
+    motion: TrialMotion,
+    T_last_lidar: jaxlie.SE3,
+    last: LastScan,
 ) -> LastScan:
     """Return what the next scan is matched with."""
     clouds = features.less_sharp, features.less_flat
     points = _Compensated(*clouds, motion, config.loam.compensate)(T_last_lidar)
-    corner, surface = points.corner.astype(jnp.float32), points.surface.astype(jnp.float32)
+    dtype = last.index.x.dtype
+    corner, surface = points.corner.astype(dtype), points.surface.astype(dtype)
     return last_scan(*clouds, corner, surface, config.features.rings)

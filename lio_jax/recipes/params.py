@@ -41,11 +41,11 @@ class MotionParams(eqx.Module):
 class ExtrinsicsParams(eqx.Module):
     """The pose and the clock of the lidar relative to the IMU."""
 
-    rotation: Float[Array, "4"] = leaf((0.0, 0.0, 0.0, 1.0), tuned="turn")
+    rotation: Float[Array, "4"] = leaf((0.0, 0.0, 0.0, 1.0), tuned="turn", moves_points=True)
     """Rotation of T_imu_lidar as a quaternion x y z w."""
-    translation: Float[Array, "3"] = leaf((0.0, 0.0, 0.0), "m", tuned="linear")
+    translation: Float[Array, "3"] = leaf((0.0, 0.0, 0.0), "m", tuned="linear", moves_points=True)
     """Position of the lidar in the IMU frame."""
-    time_offset: Scalar = leaf(0.0, "s", tuned="linear")
+    time_offset: Scalar = leaf(0.0, "s", tuned="linear", moves_points=True)
     """Lag of the lidar's clock: a scan stamped t was taken at IMU time t + time_offset."""
 
     def T_imu_lidar(self) -> jaxlie.SE3:

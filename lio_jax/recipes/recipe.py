@@ -85,7 +85,10 @@ class State(eqx.Module):
     """The map that scans are matched with: a pytree."""
 
     def varying_map(self) -> Any:
-        """Return which leaves of the map have a derivative: a prefix of its tree."""
+        """Return which leaves of the map have a derivative: a prefix of its tree.
+
+        None of them, unless a recipe says so: the map is then a constant of all derivatives.
+        """
         return False
 
     @abstractmethod
@@ -202,8 +205,6 @@ class Recipe(ABC, Generic[C, P, S]):
     near_values: ClassVar[Mapping[str, float]] = {}
     """Values by path that replace the defaults where a recording's surroundings are near, m; none: the recipe
     has one set of values for all surroundings."""
-    map_varies: ClassVar[bool] = False
-    """Whether derivatives go through the map: :meth:`State.varying_map` of its states names leaves."""
     given_values: ClassVar[Mapping[str, Any]] = {}
     """Values by path in which the recipe differs from the defaults of the back end and of the runner."""
 

@@ -14,8 +14,9 @@ from lio_jax.lidar.params import LidarParams
 from lio_jax.mapping.feature_map import FeatureMap, FeaturePoints, Frames, frames_at, matched_cubes
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.params import CubeGridParams, FeatureMapParams
-from lio_jax.registration.knn_planes import planes_near
+from lio_jax.registration.knn_planes import fitted_to, planes_near
 from lio_jax.registration.lines_and_planes import (
+    FittedTo,
     LinesAndPlanes,
     Weights,
     huber,
@@ -45,14 +46,16 @@ class FeatureMatch(ScanMatch[FeaturePoints, LinesAndPlanes]):
     def together(self, points: FeaturePoints) -> tuple[Float[Array, "k 3"], Bool[Array, " k"]]:
         return points.together()
 
-    def unmatched(self) -> LinesAndPlanes:
-        return no_lines_and_planes(self.points_at(self.T_predicted))
+    @abc.abstractmethod
+    def fitted_to(self, found: LinesAndPlanes) -> FittedTo:
+        """Return the points that lines and planes were fitted to."""
 
     def linearise(
         self, T_world_lidar: jaxlie.SE3, found: LinesAndPlanes, iteration: Int32[Array, ""]
     ) -> NormalEquations:
         points, range_sigma = self.points_at(T_world_lidar), self.lidar.range_sigma
-        return linearise(found, points, T_world_lidar, self.frames(), self.weights(), range_sigma)
+        settings = self.frames(), self.weights(), range_sigma, self.fitted_to(found)
+        return linearise(found, points, T_world_lidar, *settings)
 
 
 class ScanToFeatures(FeatureMatch):
@@ -65,6 +68,17 @@ class ScanToFeatures(FeatureMatch):
 
     def frames(self) -> Frames:
         return frames_at(self.T_predicted.translation(), self.map_params)
+
+    def unmatched(self) -> LinesAndPlanes:
+        points, dtype = self.points_at(self.T_predicted), self.map.surface.point.dtype
+        return no_lines_and_planes(points, self.neighbours, self.neighbours, dtype)
+
+    def fitted_to(self, found: LinesAndPlanes) -> FittedTo:
+        frames, sizes = self.frames(), self.map_params
+        return FittedTo(
+            fitted_to(self.map.corner, found.lines.first, frames.corner.anchor, sizes.corner_voxel_size),
+            fitted_to(self.map.surface, found.planes, frames.surface.anchor, sizes.voxel_size),
+        )
 
     def searched(self, placed: Float[Array, "k 3"], frame: Frame) -> Bool[Array, " k"]:
         """Return which points, in m from the frame's origin, are matched at all."""

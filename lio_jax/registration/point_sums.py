@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from lio_jax.core.implicit import with_derivative_of
@@ -96,3 +97,41 @@ def _summed_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     if met_dot is not None:
         total_dot += jnp.tensordot(slopes(3), met_dot, ((0, 2), (1, 0)))
     return total, total_dot
+
+
+_Axes = tuple[Array, Array, Array]
+
+
+def distance_columns(arm: _Axes, placed: _Axes, normal: _Axes, offset: Float[Array, " k"]) -> list[Array]:
+    """Return the derivatives of distances from planes by rotation and translation; then the distances, m.
+
+    Args:
+        arm: x, y and z of each point from the sensor, world axes, m.
+        placed: the same from the frame's origin.
+        normal: of each plane.
+        offset: of each plane, m.
+    """
+    (rx, ry, rz), (px, py, pz), (nx, ny, nz) = arm, placed, normal
+    distance = nx * px + ny * py + nz * pz + offset
+    return [ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx, nx, ny, nz, distance]
+
+
+_PAIRS = np.triu_indices(7)
+_PLACES = np.zeros((7, 7), np.int32)
+_PLACES[_PAIRS] = _PLACES.T[_PAIRS] = np.arange(28)
+
+
+def products(columns: list[Array], weight: Float[Array, " k"]) -> Float[Array, "28 k"]:
+    """Return weight times column times column, for each pair of columns in the order of :func:`in_order`."""
+    rows = jnp.stack(columns)
+    return (weight * rows)[_PAIRS[0]] * rows[_PAIRS[1]]
+
+
+def in_order(sums: Float[Array, "7 7"]) -> Float[Array, "28"]:
+    """Return the upper triangle of a symmetric matrix, row after row."""
+    return sums[_PAIRS]
+
+
+def as_matrix(total: Float[Array, "28"]) -> Float[Array, "7 7"]:
+    """Return the symmetric matrix of :func:`in_order`."""
+    return total[_PLACES]

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float32, Int32
+from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.prefix_sum import running_count
 from lio_jax.core.xla import computed_once
@@ -34,25 +34,25 @@ _ROUNDING = np.float32(1e-5)
 """Largest rounding error of an azimuth, rad."""
 _TURN = np.float32(2 * np.pi)
 
-_Points = tuple[Float32[Array, " k"], Float32[Array, " k"], Float32[Array, " k"]]
+_Points = tuple[Float[Array, " k"], Float[Array, " k"], Float[Array, " k"]]
 
 
 class RingIndex(eqx.Module):
     """Clouds sorted for the search; masked points come last."""
 
-    x: Float32[Array, " m"]
+    x: Float[Array, " m"]
     """Coordinate x of each point, m."""
-    y: Float32[Array, " m"]
+    y: Float[Array, " m"]
     """Coordinate y of each point, m."""
-    z: Float32[Array, " m"]
+    z: Float[Array, " m"]
     """Coordinate z of each point, m."""
     ring: Int32[Array, " m"]
     """Ring of each point; -1 where there is no point."""
-    azimuth: Float32[Array, " m"]
+    azimuth: Float[Array, " m"]
     """Azimuth of each point, rad."""
     first: Int32[Array, " cells"]
     """Place of the first point in or after each sector of each ring, ring after ring, and the end."""
-    elevation: Float32[Array, " rings"]
+    elevation: Float[Array, " rings"]
     """Mean over each ring's points, rad; infinite for a ring without any."""
 
     @property
@@ -68,11 +68,11 @@ class RingIndex(eqx.Module):
 class Queries(eqx.Module):
     """Points whose neighbours are sought."""
 
-    x: Float32[Array, " k"]
+    x: Float[Array, " k"]
     """Coordinate x of each query, m, in the index's frame."""
-    y: Float32[Array, " k"]
+    y: Float[Array, " k"]
     """Coordinate y of each query, m, in the index's frame."""
-    z: Float32[Array, " k"]
+    z: Float[Array, " k"]
     """Coordinate z of each query, m, in the index's frame."""
     lowest: Int32[Array, " k"]
     """First ring of the cloud to search."""
@@ -95,9 +95,9 @@ class Nearest(eqx.Module):
 
 
 def ring_index(
-    points: Float32[Array, "m 3"], ring: Int32[Array, " m"], mask: Bool[Array, " m"], rings: int
+    points: Float[Array, "m 3"], ring: Int32[Array, " m"], mask: Bool[Array, " m"], rings: int
 ) -> RingIndex:
-    """Sort clouds.
+    """Sort clouds. Their coordinates keep their derivative; the order is a choice, which has none.
 
     Args:
         points: m.
@@ -108,7 +108,7 @@ def ring_index(
     count = len(points)
     row_bits = (count - 1).bit_length()
     sectors = min(_SECTORS, 1 << (((1 << (32 - row_bits)) - 1) // rings).bit_length() - 1)
-    x, y, z = computed_once(tuple(points.T))
+    x, y, z = computed_once(tuple(jax.lax.stop_gradient(points).astype(jnp.float32).T))
     angle = azimuth(x, y)
     cell = jnp.where(mask, ring * sectors + _sector(angle, sectors), rings * sectors)
     row = jnp.arange(count, dtype=jnp.uint32)
@@ -120,9 +120,10 @@ def ring_index(
 
     elevation = azimuth(jnp.sqrt(x**2 + y**2), z)
     terms = jnp.stack([elevation, jnp.ones_like(elevation)], -1)
-    total = jnp.zeros((rings, 2), jnp.float32).at[jnp.where(mask, ring, rings)].add(terms, mode="drop")
+    total = jnp.zeros((rings, 2), terms.dtype).at[jnp.where(mask, ring, rings)].add(terms, mode="drop")
     mean = jnp.where(total[:, 1] > 0, total[:, 0] / jnp.maximum(total[:, 1], 1.0), jnp.inf)
-    x, y, z, angle, ring, mask = (_take(column, order) for column in (x, y, z, angle, ring, mask))
+    columns = (*points.T, angle, ring, mask)
+    x, y, z, angle, ring, mask = (_take(column, order) for column in columns)
     return RingIndex(x, y, z, jnp.where(mask, ring, -1), angle, first, mean)
 
 
@@ -131,8 +132,8 @@ def nearest_by_ring(
     queries: Queries,
     mask: Bool[Array, " k"],
     cloud_rings: int,
-    radius: Float32[Array, ""],
-    rings_apart: Float32[Array, ""],
+    radius: Float[Array, ""],
+    rings_apart: Float[Array, ""],
 ) -> Nearest:
     """Return, for each query, the nearest point, the next one of its ring and the nearest of another ring.
 
@@ -193,8 +194,8 @@ class _Search(eqx.Module):
     """What all queries share."""
 
     index: RingIndex
-    radius: Float32[Array, ""]
-    rings_apart: Float32[Array, ""]
+    radius: Float[Array, ""]
+    rings_apart: Float[Array, ""]
     cloud_rings: int = eqx.field(static=True)
 
     def nearest(self, queries: Queries, side: int, window: int) -> tuple[Array, Bool[Array, " k"]]:
@@ -253,13 +254,13 @@ class _Search(eqx.Module):
         other = _least(squared, within & (step > 0) & (step < self.rings_apart))
         return (same, other), jnp.ones_like(nearest, bool)
 
-    def _squared(self, queries: Queries) -> Float32[Array, "m k"]:
+    def _squared(self, queries: Queries) -> Float[Array, "m k"]:
         index = self.index
         squared = queries.away_from((index.x[:, None], index.y[:, None], index.z[:, None]))
         return computed_once(jnp.where(squared < self.radius**2, squared, jnp.inf))
 
 
-def _least(squared: Float32[Array, "m k"], allowed: Bool[Array, "m k"]) -> Int32[Array, " k"]:
+def _least(squared: Float[Array, "m k"], allowed: Bool[Array, "m k"]) -> Int32[Array, " k"]:
     """Return the row of each column's smallest allowed value, -1 where there is no finite one."""
     least = jnp.min(jnp.where(allowed, squared, jnp.inf), 0)
     here = allowed & (squared == least) & jnp.isfinite(least)
@@ -275,7 +276,7 @@ class _Windows(eqx.Module):
     """Place of the ring's first point."""
     size: Int32[Array, "b k"]
     """The ring's points; 0 beyond the cloud's rings."""
-    elevation: Float32[Array, "b k"]
+    elevation: Float[Array, "b k"]
     """Elevation of the ring, rad."""
     begin: Int32[Array, "b k"]
     """From ``start`` to the window's first point; negative where the window begins at the ring's end."""
@@ -307,7 +308,8 @@ class _Windows(eqx.Module):
         # a ring shorter than the window would show its points twice
         squared = jnp.where((step < self.size) & (squared < self.search.radius**2), squared, jnp.inf)
         band = jnp.arange(len(self.size), dtype=jnp.int32)[:, None]
-        keys = jax.lax.bitcast_convert_type(squared, jnp.int32) & ~self._mask | step * len(self.size) + band
+        bits = jax.lax.bitcast_convert_type(squared.astype(jnp.float32), jnp.int32)
+        keys = bits & ~self._mask | step * len(self.size) + band
         return keys.reshape(-1, keys.shape[-1])
 
     def smallest(self, keys: Int32[Array, "n k"], allowed: Bool[Array, "..."]) -> tuple[Array, Array]:
@@ -334,7 +336,7 @@ class _Windows(eqx.Module):
         step += jnp.where(step < 0, size, jnp.where(step >= size, -size, 0))
         return number == step * len(self.size) + band
 
-    def reach(self) -> Float32[Array, " k"]:
+    def reach(self) -> Float[Array, " k"]:
         """Return a distance within which no point of the rings lies outside of the windows, m."""
         x, y, z = self.queries.x, self.queries.y, self.queries.z
         angle, level = azimuth(x, y), jnp.sqrt(x**2 + y**2)

@@ -7,15 +7,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float32
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float
 
 from lio_jax.core.xla import computed_once
 from lio_jax.lidar.features import FeatureCloud
 from lio_jax.mapping.feature_map import FeaturePoints, Frames
 from lio_jax.mapping.frame import Frame
 from lio_jax.registration.feature_match import FeatureMatch
-from lio_jax.registration.knn_planes import FittedPlanes
-from lio_jax.registration.lines_and_planes import Lines, LinesAndPlanes, line_through
+from lio_jax.registration.knn_planes import FittedPlanes, beside_each_match
+from lio_jax.registration.lines_and_planes import (
+    FittedTo,
+    Lines,
+    LinesAndPlanes,
+    line_through,
+    no_lines_and_planes,
+)
 from lio_jax.registration.params import ScanToScanParams
 from lio_jax.registration.ring_index import Nearest, Queries, RingIndex, nearest_by_ring, ring_index
 
@@ -28,12 +35,17 @@ class LastScan(eqx.Module):
     index: RingIndex
     """Less sharp points, then less flat ones, which count as rings of their own."""
 
+    def varying(self) -> "LastScan":
+        """Return a tree of booleans: the points have a derivative."""
+        fixed = jax.tree.map(lambda _: False, self)
+        return eqx.tree_at(lambda one: (one.index.x, one.index.y, one.index.z), fixed, (True, True, True))
+
 
 def last_scan(
     corner: FeatureCloud,
     surface: FeatureCloud,
-    corner_points: Float32[Array, "c 3"],
-    surface_points: Float32[Array, "s 3"],
+    corner_points: Float[Array, "c 3"],
+    surface_points: Float[Array, "s 3"],
     rings: int,
 ) -> LastScan:
     """Prepare a scan's less sharp and less flat points for the next scan.
@@ -50,10 +62,10 @@ def last_scan(
     return LastScan(ring_index(points, ring, jnp.concatenate([corner.mask, surface.mask]), 2 * rings))
 
 
-def empty_scan(corners: int, surfaces: int, rings: int) -> LastScan:
-    """Return a scan without points, of the given capacities."""
+def empty_scan(corners: int, surfaces: int, rings: int, dtype: DTypeLike = jnp.float32) -> LastScan:
+    """Return a scan without points, of the given capacities and the dtype of coordinates."""
     none = jnp.zeros(corners + surfaces, jnp.int32)
-    return LastScan(ring_index(jnp.zeros((len(none), 3), jnp.float32), none, none > 0, 2 * rings))
+    return LastScan(ring_index(jnp.zeros((len(none), 3), dtype), none, none > 0, 2 * rings))
 
 
 class ScanToScan(FeatureMatch):
@@ -66,6 +78,16 @@ class ScanToScan(FeatureMatch):
         # the last scan's own axes
         here = Frame(jnp.zeros(3, jnp.int32), jnp.zeros_like(self.T_predicted.translation()))
         return Frames(here, here)
+
+    def unmatched(self) -> LinesAndPlanes:
+        return no_lines_and_planes(self.points_at(self.T_predicted), 2, 3, self.last.index.x.dtype)
+
+    def fitted_to(self, found: LinesAndPlanes) -> FittedTo:
+        def at(planes: FittedPlanes) -> Array:
+            points = jnp.stack(self.last.index.at(jnp.where(planes.valid, planes.entry, 0)))
+            return beside_each_match(points, planes.valid)
+
+        return FittedTo(at(found.lines.first), at(found.planes))
 
     def associate(self, points: FeaturePoints, T_world_lidar: jaxlie.SE3) -> LinesAndPlanes:
         """Find lines and planes.
@@ -98,24 +120,25 @@ class ScanToScan(FeatureMatch):
 
 
 def _lines(index: RingIndex, found: Nearest) -> Lines:
-    here, there = (index.at(jnp.maximum(place, 0)) for place in (found.nearest, found.other_ring))
+    entry = jnp.stack([found.nearest, found.other_ring])
+    here, there = (index.at(place) for place in jnp.maximum(entry, 0))
     along = _difference(there, here)
     length = _length(along)
     valid = (found.other_ring >= 0) & (length > 0)
     direction = jnp.stack(along, -1) / jnp.where(valid, length, 1.0)[:, None]
-    return line_through(here, direction, valid)
+    return line_through(here, direction, valid, entry)
 
 
 def _planes(index: RingIndex, found: Nearest) -> FittedPlanes:
-    places = (found.nearest, found.same_ring, found.other_ring)
-    here, along, aside = computed_once(tuple(index.at(jnp.maximum(place, 0)) for place in places))
+    entry = jnp.stack([found.nearest, found.same_ring, found.other_ring])
+    here, along, aside = computed_once(tuple(index.at(place) for place in jnp.maximum(entry, 0)))
     along, aside = _difference(along, here), _difference(aside, here)
     normal = computed_once(_cross(along, aside))
     area = _length(normal)
     valid = (found.same_ring >= 0) & (found.other_ring >= 0) & (area > 0)
     nx, ny, nz = (axis / jnp.where(valid, area, 1.0) for axis in normal)
     offset = -(nx * here[0] + ny * here[1] + nz * here[2])
-    return FittedPlanes(jnp.stack([nx, ny, nz], -1), offset, valid)
+    return FittedPlanes(jnp.stack([nx, ny, nz], -1), offset, valid, entry)
 
 
 def _difference(left: _Vectors, right: _Vectors) -> _Vectors:

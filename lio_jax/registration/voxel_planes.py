@@ -10,7 +10,7 @@ import jaxlie
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.geometry import across
+from lio_jax.core.geometry import normal_slope3
 from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.xla import computed_once
 from lio_jax.lidar.params import BeamParams
@@ -93,11 +93,6 @@ def surface_slope(
 ) -> Surface:
     """Return how means, normals and the two smaller variances change with the moments.
 
-    With A n = l n, a change dA turns the normal by -(A - l I)^+ dA n and changes a variance of direction v by
-    v' dA v (Magnus, "On differentiating eigenvalues and eigenvectors", 1985). In the inverse, a gap g between
-    variances becomes (g^2 + e^2) / g with a tiny e, because the normal is undefined where two variances
-    meet; a match gives it no weight there.
-
     Args:
         moments: of each voxel.
         normal: of each voxel's plane.
@@ -106,47 +101,15 @@ def surface_slope(
     count = jnp.maximum(moments[:, :1], 1.0)
     mean, diagonal, off_diagonal = mean_and_covariance(moments)
     moved = change[:, 1:4] / count
-    A = _symmetric(diagonal, off_diagonal)
     both = mean[:, :, None] * moved[:, None, :]
-    dA = _symmetric(change[:, 4:7] / count, change[:, 7:10] / count) - both - jnp.swapaxes(both, 1, 2)
-    basis = jnp.stack(across(normal), -1)
-
-    def within(matrix: Array, left: Array, right: Array) -> Array:
-        return jnp.einsum("kia,kij,kjb->kab", left, matrix, right)
-
-    n = normal[:, :, None]
-    smallest, change_of_smallest = within(A, n, n)[:, 0, 0], within(dA, n, n)[:, 0, 0]
-    M, dM = within(A, basis, basis), within(dA, basis, basis)
-    half, mixed = (M[:, 0, 0] - M[:, 1, 1]) / 2, M[:, 0, 1]
-    radius = jnp.sqrt(jnp.maximum(half**2 + mixed**2, 1e-30))
-    change_of_radius = (half * (dM[:, 0, 0] - dM[:, 1, 1]) / 2 + mixed * dM[:, 0, 1]) / radius
-    change_of_middle = (dM[:, 0, 0] + dM[:, 1, 1]) / 2 - change_of_radius
-
-    middle = (M[:, 0, 0] + M[:, 1, 1]) / 2 - smallest
-    least = _LEAST_GAP * (M[:, 0, 0] + M[:, 1, 1]) + _LEAST_VARIANCE
-    low, high = (gap / (gap**2 + least**2) for gap in (middle - radius, middle + radius))
-    mean_inverse, cosine, sine = (
-        (low + high) / 2,
-        *((high - low) / 2 * side / radius for side in (half, mixed)),
-    )
-    c, d = within(dA, basis, n)[:, :, 0].T
-    turn = jnp.stack([mean_inverse * c + cosine * c + sine * d, mean_inverse * d + sine * c - cosine * d], -1)
-    return Surface(
-        moved,
-        -jnp.einsum("kia,ka->ki", basis, turn),
-        jnp.stack([change_of_smallest, change_of_middle], -1),
-    )
+    second = _symmetric(change[:, 4:7] / count, change[:, 7:10] / count)
+    dA = second - both - jnp.swapaxes(both, 1, 2)
+    return Surface(moved, *normal_slope3(_symmetric(diagonal, off_diagonal), normal, dA))
 
 
 def _symmetric(diagonal: Float[Array, "k 3"], off_diagonal: Float[Array, "k 3"]) -> Array:
     (xx, yy, zz), (xy, xz, yz) = diagonal.T, off_diagonal.T
     return jnp.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
-
-
-_LEAST_GAP = 1e-6
-"""Share of the larger variances below which the gap between the two smaller ones counts as none."""
-_LEAST_VARIANCE = 1e-9
-"""The same for all variances, m^2: a voxel may hold coincident points."""
 
 
 class PointNoise(eqx.Module):

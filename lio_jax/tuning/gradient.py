@@ -13,13 +13,14 @@ from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.recipes import recipe_named
 from lio_jax.recipes.params import RecipeConfig as Config
+from lio_jax.run.fitted_settings import ring_count
 from lio_jax.run.run import settings_for
 from lio_jax.settings.settings import Settings, recipe_of, recipe_settings
 from lio_jax.tuning.objectives import Named, Objective, objective_named
 from lio_jax.tuning.parameters import ParameterVector, free_parameters
 from lio_jax.tuning.recording import Recording
-from lio_jax.tuning.reverse import checkpointed_gradient
-from lio_jax.tuning.streaming import objective_values, streaming_gradient
+from lio_jax.tuning.reverse import TotalGradient, checkpointed_gradient
+from lio_jax.tuning.streaming import Gradient, objective_values, streaming_gradient
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ def gradient(
     truth: Trajectory | None = None,
     start: int = 0,
     count: int | None = None,
-    mode: Literal["forward", "reverse"] = "forward",
+    mode: Literal["auto", "forward", "reverse"] = "auto",
     through_map: bool | None = None,
 ) -> NamedGradient:
     """Return the objective of a recording and its gradient.
@@ -60,28 +61,25 @@ def gradient(
         start: first scan.
         count: number of scans; None: to the end.
         mode: forward: constant memory, time grows with the number of parameters; reverse: time does not grow
-            with it, memory grows with the number of scans, all of which are kept.
+            with it, memory grows with the number of scans, all of which are kept; auto: reverse where there
+            are more than 32 parameters.
         through_map: whether the map moves with the poses at which its points were inserted, which costs time
-            and 40 bytes per slot of the map and parameter; None: where :func:`wants_map` says so and the
-            recipe can.
+            and memory: per parameter 40 bytes for each slot of a voxel map, and 324 bytes for each block of a
+            map of points, of which loam and lio_sam have two; None: where :func:`wants_map` says so.
 
     Raises:
         UsageError: a parameter, an objective or a mode is not known, or can't be differentiated.
     """
-    if mode not in ("forward", "reverse"):
-        raise UsageError(f"mode '{mode}' is not known; there are: forward, reverse.")
+    if mode not in ("auto", "forward", "reverse"):
+        raise UsageError(f"mode '{mode}' is not known; there are: auto, forward, reverse.")
     resolved, _ = settings_for(sequence, settings or recipe_settings("default"))
-    free = free_parameters(resolved.params(), list(patterns))
+    free = free_parameters(resolved.params(), list(patterns), lambda: ring_count(sequence.scans()))
     named = objective_named(objective) if isinstance(objective, str) else Named(objective, False, False)
     recipe = recipe_of(resolved)
-    if through_map and not recipe.map_varies:
-        raise UsageError(
-            f"the recipe {resolved.recipe} takes its map as a constant of the derivative: leave through_map "
-            "out, or use the recipe default."
-        )
-    through_map = recipe.map_varies and (wants_map(named, free) if through_map is None else through_map)
+    through_map = wants_map(named, free) if through_map is None else through_map
     recording = Recording(sequence, resolved, start, count, truth, keep=False)
-    differentiate = streaming_gradient if mode == "forward" else checkpointed_gradient
+    forward = mode == "forward" or (mode == "auto" and len(free.names) <= _MOST_FORWARD)
+    differentiate = streaming_gradient if forward else checkpointed_gradient
     result = differentiate(recipe, free, named.objective, free.first(), recording, through_map=through_map)
     by_name = dict(zip(free.names, result.gradient.tolist(), strict=True))
     return NamedGradient(result.value, by_name, result.unconverged, through_map)
@@ -90,15 +88,19 @@ def gradient(
 def wants_map(named: Named, free: ParameterVector) -> bool:
     """Return whether a derivative is wrong as long as the map is a constant of it.
 
-    It is for trajectory errors, the blur of the map and all derivatives by extrinsics, and it is not for
-    likelihoods by noise densities and weights: ``python experiments/gradient_check.py`` compares both with
-    the slope of the objective.
+    It is for trajectory errors, the blur of the map and all derivatives by extrinsics and by corrections of
+    the points. It is not for likelihoods by noise densities and weights: ``python
+    experiments/gradient_check.py`` compares both with the slope of the objective.
 
     Args:
         named: the objective.
         free: the parameters.
     """
-    return not named.likelihood or any(path.startswith("extrinsics.") for path in free.paths)
+    return not named.likelihood or any(one.moves_points for one in free.declared)
+
+
+_MOST_FORWARD = 32
+"""Number of parameters up to which forward mode is taken."""
 
 
 @dataclass(frozen=True)
@@ -108,15 +110,19 @@ class Evaluated:
     value: float
     gradient: NDArray[np.float64]
     """(p,)."""
-    scores: NDArray[np.float64]
-    """(n, p) each scan's share of the gradient of the sum over all scans."""
+    scores: NDArray[np.float64] | None
+    """(n, p) each scan's share of the gradient of the sum over all scans; None by reverse mode."""
     unconverged: int
     """Scans whose solve did not converge: with many of them the gradient is not to be trusted."""
     scans: int
 
 
 class Loss:
-    """Mean objective over recordings, weighted by their numbers of scans."""
+    """Mean objective over recordings, weighted by their numbers of scans.
+
+    Its gradient is by forward mode, or by reverse mode where there are so many parameters that this is
+    faster and nobody needs the scores.
+    """
 
     def __init__(
         self,
@@ -125,25 +131,32 @@ class Loss:
         free: ParameterVector,
         objective: Objective,
         through_map: bool = False,
+        scores: bool = True,
     ) -> None:
-        """Keep what the loss is of, and whether its derivative goes through the map."""
+        """Keep what the loss is of, whether its derivative goes through the map, and who needs scores."""
         self._loss_of = recipe_named(recipe)(config), free, objective
         self._through_map = through_map
+        self._forward = scores or len(free.names) <= _MOST_FORWARD
 
     def __call__(self, x: NDArray[np.float64], recordings: Listing[Recording]) -> Evaluated:
         """Return the loss at a vector of parameters, with its gradient."""
-        results = [
-            streaming_gradient(*self._loss_of, jnp.asarray(x), recording, self._through_map)
-            for recording in recordings
-        ]
-        counts = np.array([len(result.scores) for result in results])
+        about = *self._loss_of, jnp.asarray(x)
+        results: list[Gradient] | list[TotalGradient]
+        if self._forward:
+            results = [streaming_gradient(*about, one, self._through_map) for one in recordings]
+            counts = np.array([len(result.scores) for result in results])
+            weighted = [count * result.scores for count, result in zip(counts, results, strict=True)]
+            scores = np.concatenate(weighted)
+        else:
+            results = [
+                checkpointed_gradient(*about, one, through_map=self._through_map) for one in recordings
+            ]
+            counts, scores = np.array([len(one) for one in recordings]), None
         shares = counts / counts.sum()
         return Evaluated(
             value=float(shares @ [result.value for result in results]),
             gradient=shares @ np.stack([result.gradient for result in results]),
-            scores=np.concatenate(
-                [count * result.scores for count, result in zip(counts, results, strict=True)]
-            ),
+            scores=scores,
             unconverged=sum(len(result.unconverged) for result in results),
             scans=int(counts.sum()),
         )

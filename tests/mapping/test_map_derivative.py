@@ -1,4 +1,4 @@
-"""The derivative of a voxel map's moments by the points that were inserted, forgotten voxels included."""
+"""The derivative of what a map holds by the points inserted, forgotten and replaced ones included."""
 
 import equinox as eqx
 import jax
@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lio_jax.mapping import point_map
 from lio_jax.mapping.voxel_map import FREE, empty_map, following, insert
 
 SIZE, REACH = jnp.float64(1.0), jnp.float64(40.0)
@@ -71,3 +72,34 @@ def test_nothing_added_changes_nothing():
         return following(vmap, vmap, nothing, points, nothing, again, ANCHORS[0], SIZE).moments
 
     np.testing.assert_array_equal(jax.jacfwd(moments)(jnp.zeros(2)), 0.0)
+
+
+def point_drive(parameters, clouds, anchors, capacity):
+    """Return the map of points after the clouds, its cube moved to each anchor."""
+    pmap, half, margin = point_map.empty_map(capacity, jnp.float64), jnp.float64(5.0), jnp.float64(3.0)
+    for (points, directions), anchor in zip(clouds, anchors, strict=True):
+        moving = Moved(points, directions, parameters)(jnp.arange(len(points)))
+        mask = jnp.arange(len(points)) % 10 != 0
+        inserted, found = point_map.insert(pmap, moving, mask, anchor, SIZE, half, jnp.float64(0.01))
+        cleared = point_map.move_cube(inserted, anchor, half, margin)
+        pmap = point_map.following(cleared, pmap, inserted, found.added, moving, anchor, SIZE)
+    return pmap
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_the_points_of_a_map_follow(mode):
+    anchors = [jnp.asarray(anchor, jnp.int32) for anchor in ([0, 0, 0], [1, 0, 0], [4, 0, 0])]
+
+    def held(parameters, count=3):
+        return point_drive(parameters, CLOUDS[:count], anchors[:count], 512).point
+
+    at = jnp.asarray([0.01, -0.02])
+    slope, last = mode(held)(at), held(at)
+    known = np.isfinite(last)
+    before = np.asarray(held(at, 2))
+    assert (np.isfinite(before) & known & (before != last)).sum() > 50, "points are replaced"
+    assert (np.isfinite(before) & ~known).sum() > 100, "points are left behind"
+    for component in range(2):
+        step = 1e-8 * np.eye(2)[component]
+        difference = (np.asarray(held(at + step)) - np.asarray(held(at - step))) / 2e-8
+        np.testing.assert_allclose(slope[..., component][known], difference[known], atol=1e-5)

@@ -13,9 +13,11 @@ from lio_jax.mapping.point_map import EDGE, empty_map, insert
 from lio_jax.mapping.voxel_map import anchor_of
 from lio_jax.registration.knn_planes import planes_near
 from lio_jax.registration.lines_and_planes import (
+    FittedTo,
     LinesAndPlanes,
     fit_lines,
     huber,
+    line_through,
     linearise,
     lines_near,
     no_lines_and_planes,
@@ -29,14 +31,24 @@ PARAMS = SETTINGS.params()
 POSE = jaxlie.SE3.from_rotation_and_translation(
     jaxlie.SO3.from_rpy_radians(0.03, -0.02, 0.4), jnp.array([1.3, -0.7, 1.6])
 )
-_fit = jax.jit(fit_lines)
+
+
+@jax.jit
+def _fit(x, y, z):
+    centre, direction, variances = fit_lines(x, y, z)
+    lines = line_through(centre, direction, jnp.ones(x.shape[1], bool), jnp.zeros(x.shape, jnp.int32))
+    return lines, direction, variances
+
+
 _lines = jax.jit(lines_near, static_argnums=6)
 _planes = jax.jit(planes_near, static_argnums=6)
 
 
 @jax.jit
 def _linearise(matches, points, T, frames, kernel, range_sigma):
-    return linearise(matches, points, T, frames, huber(kernel), range_sigma)
+    corners, surfaces = matches.lines.first.entry, matches.planes.entry
+    fitted_to = FittedTo(*(jnp.zeros((entry.shape[1], 3 * len(entry))) for entry in (corners, surfaces)))
+    return linearise(matches, points, T, frames, huber(kernel), range_sigma, fitted_to)
 
 
 def params_with(*assignments: str):
@@ -165,7 +177,7 @@ def some_matches(seed: int = 0):
         jnp.asarray(rng.random(surfaces) > 0.2),
     )
     frames = Frames(frame_of(0.4), frame_of(0.8))
-    empty = no_lines_and_planes(points)
+    empty = no_lines_and_planes(points, 5, 5, jnp.float32)
     _, corner = frames.corner.place(points.corner, POSE)
     _, surface = frames.surface.place(points.surface, POSE)
     direction = units(corners)
@@ -175,8 +187,8 @@ def some_matches(seed: int = 0):
 
     def through(normal: np.ndarray, near: jax.Array, valid: jax.Array):
         offset = -np.sum(normal * np.asarray(near), 1) + rng.normal(0, 0.1, len(normal))
-        kind = type(empty.planes)
-        return kind(jnp.asarray(normal, jnp.float32), jnp.asarray(offset, jnp.float32), valid)
+        kind, entry = type(empty.planes), jnp.zeros((5, len(normal)), jnp.int32)
+        return kind(jnp.asarray(normal, jnp.float32), jnp.asarray(offset, jnp.float32), valid, entry)
 
     lines = type(empty.lines)(
         through(first, corner, points.corner_mask), through(second, corner, points.corner_mask)
@@ -272,7 +284,7 @@ def test_what_stands_in_masked_rows_does_not_matter(filler):
 
 def test_nothing_matched_gives_finite_zeros():
     _, points, frames = some_matches()
-    nothing = no_lines_and_planes(points)
+    nothing = no_lines_and_planes(points, 5, 5, jnp.float32)
     equations = _linearise(nothing, points, POSE, frames, jnp.float64(0.1), jnp.float64(0.05))
     assert equations.matches == 0
     assert all((np.asarray(leaf) == 0).all() for leaf in jax.tree.leaves(equations))

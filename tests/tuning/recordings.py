@@ -66,6 +66,8 @@ def settings(recipe: str, inertial: bool, *more: str) -> Settings:
         offset,
         "params.lidar.angle_sigma=0.001",
         "params.lidar.surface_sigma=0.02",
+        "params.lidar.ring_elevation_offset=[0.0, 0.001, -0.002]",
+        "params.lidar.ring_range_offset=[0.02, -0.01]",
         *more,
     ]
     if not inertial:

@@ -16,9 +16,10 @@ from lio_jax.recipes import recipe
 from lio_jax.run.track import ScanInput
 from lio_jax.tuning.objectives import TruePose
 from lio_jax.tuning.parameters import free_parameters
-from lio_jax.tuning.reverse import checkpointed_gradient
+from lio_jax.tuning.reverse import TotalGradient, checkpointed_gradient
 from lio_jax.tuning.streaming import streaming_gradient
 from tests.params import default_params
+from tests.tuning.recordings import drive
 
 SCANS, EMPTY = 11, (0, 3)
 
@@ -92,3 +93,23 @@ def test_reverse_mode_gives_the_numbers_of_forward_mode(every):
     assert backward.value == pytest.approx(forward.value, rel=1e-12)
     np.testing.assert_allclose(backward.gradient, forward.gradient, rtol=1e-10)
     assert np.all(forward.gradient != 0)
+
+
+@pytest.mark.parametrize(
+    ("mode", "most", "expected"), [("auto", 3, "forward"), ("auto", 2, "reverse"), ("reverse", 3, "reverse")]
+)
+def test_the_mode_follows_the_number_of_parameters(monkeypatch, mode, most, expected):
+    from lio_jax.tuning import gradient as module
+
+    def taken(name):
+        def differentiate(recipe, free, *_, through_map):
+            return TotalGradient({"forward": 1.0, "reverse": 2.0}[name], np.zeros(len(free.names)), ())
+
+        return differentiate
+
+    monkeypatch.setattr(module, "streaming_gradient", taken("forward"))
+    monkeypatch.setattr(module, "checkpointed_gradient", taken("reverse"))
+    monkeypatch.setattr(module, "_MOST_FORWARD", most)
+    found = module.gradient(drive(), ["extrinsics.translation"], "map", count=2, mode=mode)
+    assert found.value == {"forward": 1.0, "reverse": 2.0}[expected]
+    assert found.through_map

@@ -23,7 +23,7 @@ STEPS = {
     "imu.gyro_bias_walk": 1e-3,
     "imu.accel_bias_walk": 1e-3,
     "imu.gravity": 1e-6,
-    "extrinsics": 1e-8,
+    "where points lie": 1e-8,
     "": 1e-5,
 }
 """Steps: small where points move, so that they keep their planes; large where the effect is small."""
@@ -36,7 +36,10 @@ SMOOTHER_STEPS = {
     "imu.gyro_bias_walk": 1e-2,
     "imu.accel_bias_walk": 1e-2,
     "imu.gravity": 1e-5,
-    "extrinsics": 1e-6,
+    "where points lie": 1e-6,
+    # their lever arm is the range
+    "lidar.elevation_offset": 1e-8,
+    "lidar.range_scale": 1e-8,
 }
 SMOOTHER_NOISE = 1e-8
 """Information of states that spans sixteen orders of magnitude leaves fewer digits."""
@@ -146,8 +149,8 @@ def check_gradients(recipe: str, inertial: bool) -> None:
     steps, noise = (SMOOTHER_STEPS, SMOOTHER_NOISE) if recipe == "lio_sam" else (STEPS, NOISE)
     # a total's rounding grows with it
     noise *= max(1.0, abs(result.value))
-    for component, name in enumerate(free.names):
-        step = steps.get(name, steps.get(name.split(".")[0], steps[""]))
+    for component, (name, declared) in enumerate(zip(free.names, free.declared, strict=True)):
+        step = steps.get(name, steps["where points lie" if declared.moves_points else ""])
         ends = [x + sign * step * (np.arange(len(x)) == component) for sign in (1, -1)]
         high, low = (total(HeldMap(chosen, free(end), nominal), recording) for end in ends)
         difference = (high - low) / (2 * step)
