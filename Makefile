@@ -9,8 +9,9 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 demo: $(VENV)/.installed
 	$(BIN)/lio-jax demo --out out/demo --overwrite
 
-# a file's tests stay in one process: they share drives and programs
-PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile
+# A file's tests stay in one process: they share drives and programs. A process that dies ends the run,
+# because the others would wait for its tests for ever.
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --max-worker-restart 0
 
 test: $(VENV)/.installed-dev
 	$(PYTEST) -m "not long"

@@ -38,15 +38,16 @@ TIGHT = [
 
 
 @cache
-def drive() -> SimulatedSequence:
+def drive(world: str = "street", beams: int = 16, columns: int = 256) -> SimulatedSequence:
     """Return a drive that has begun before the first scan."""
     T_imu_lidar = np.eye(4)
     # away from the borders of the map's grid
     T_imu_lidar[:3, 3] = 0.06, 0.03, 0.25
     return SimulatedSequence(
+        world,
         duration_s=SCANS * 0.1,
-        beams=16,
-        columns=256,
+        beams=beams,
+        columns=columns,
         seed=3,
         imu=ImuModel(),
         moving_start=True,
@@ -54,8 +55,8 @@ def drive() -> SimulatedSequence:
     )
 
 
-def settings(recipe: str, inertial: bool, *more: str) -> Settings:
-    """Return a recipe's settings with a small program and every sigma above zero."""
+def settings(recipe: str, inertial: bool, *more: str, of: SimulatedSequence | None = None) -> Settings:
+    """Return a recipe's settings for a drive with a small program and every sigma above zero."""
     section = DEFAULTS["initial"]
     positive = [f"params.initial.{name}={value or 0.01}" for name, value in section.items()]
     # samples and scans of a simulation share their instants, where the sampling has a kink
@@ -74,7 +75,7 @@ def settings(recipe: str, inertial: bool, *more: str) -> Settings:
         overrides.append("config.imu.use=false")
     read = declared_settings(recipe)
     overrides = [one for one in overrides if one.partition("=")[0] in read]
-    return settings_for(drive(), with_overrides(recipe_settings(recipe), overrides))[0]
+    return settings_for(of or drive(), with_overrides(recipe_settings(recipe), overrides))[0]
 
 
 class DoubleRecording(Recording):
