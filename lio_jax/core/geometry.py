@@ -106,27 +106,33 @@ def normal_slope3(
         normal: unit eigenvectors of the smallest eigenvalues.
         change: symmetric.
     """
-    basis = jnp.stack(across(normal), -1)
+    first, second = across(normal)
+    n, u, v = normal.T, first.T, second.T
+    A, dA = jnp.moveaxis(matrix, 0, -1), jnp.moveaxis(change, 0, -1)
 
-    def within(between: Array, left: Array, right: Array) -> Array:
-        return jnp.einsum("kia,kij,kjb->kab", left, between, right)
+    def within(of: Array, left: Array, right: Array) -> Array:
+        # sums of products over whole columns: XLA makes slow loops of many products of 3 x 3 matrices
+        turned = [of[i, 0] * right[0] + of[i, 1] * right[1] + of[i, 2] * right[2] for i in range(3)]
+        return left[0] * turned[0] + left[1] * turned[1] + left[2] * turned[2]
 
-    n = normal[:, :, None]
-    smallest, change_of_smallest = within(matrix, n, n)[:, 0, 0], within(change, n, n)[:, 0, 0]
-    M, dM = within(matrix, basis, basis), within(change, basis, basis)
-    half, mixed = (M[:, 0, 0] - M[:, 1, 1]) / 2, M[:, 0, 1]
+    smallest, change_of_smallest = within(A, n, n), within(dA, n, n)
+    uu, vv, mixed = within(A, u, u), within(A, v, v), within(A, u, v)
+    d_uu, d_vv, d_mixed = within(dA, u, u), within(dA, v, v), within(dA, u, v)
+    half = (uu - vv) / 2
     radius = jnp.sqrt(jnp.maximum(half**2 + mixed**2, 1e-30))
-    change_of_radius = (half * (dM[:, 0, 0] - dM[:, 1, 1]) / 2 + mixed * dM[:, 0, 1]) / radius
-    change_of_middle = (dM[:, 0, 0] + dM[:, 1, 1]) / 2 - change_of_radius
+    change_of_radius = (half * (d_uu - d_vv) / 2 + mixed * d_mixed) / radius
+    change_of_middle = (d_uu + d_vv) / 2 - change_of_radius
 
-    middle = (M[:, 0, 0] + M[:, 1, 1]) / 2 - smallest
-    least = _LEAST_GAP * jnp.abs(M[:, 0, 0] + M[:, 1, 1]) + _LEAST_VARIANCE
+    middle = (uu + vv) / 2 - smallest
+    least = _LEAST_GAP * jnp.abs(uu + vv) + _LEAST_VARIANCE
     low, high = (gap / (gap**2 + least**2) for gap in (middle - radius, middle + radius))
     mean_inverse = (low + high) / 2
     cosine, sine = ((high - low) / 2 * side / radius for side in (half, mixed))
-    c, d = within(change, basis, n)[:, :, 0].T
-    turn = jnp.stack([mean_inverse * c + cosine * c + sine * d, mean_inverse * d + sine * c - cosine * d], -1)
-    return -jnp.einsum("kia,ka->ki", basis, turn), jnp.stack([change_of_smallest, change_of_middle], -1)
+    c, d = within(dA, u, n), within(dA, v, n)
+    by_first = mean_inverse * c + cosine * c + sine * d
+    by_second = mean_inverse * d + sine * c - cosine * d
+    turn = -(by_first[:, None] * first + by_second[:, None] * second)
+    return turn, jnp.stack([change_of_smallest, change_of_middle], -1)
 
 
 _LEAST_GAP = 1e-6

@@ -127,8 +127,8 @@ def step(
         T_world_lidar, T_matched = lidar_pose(posterior.nav), lidar_pose(matched)
         frame, matches = match.frame(), update.measurement.aux.association.found
         sigmas = params.lidar, params.registration
-        moments = matches.moments_in(state.map)
-        evidence = point_evidence(matches, to_match, T_matched, frame, *sigmas, moments)
+        coordinates = matches.coordinates_in(state.map)
+        evidence = point_evidence(matches, to_match, T_matched, frame, *sigmas, coordinates)
         missed = jnp.linalg.norm((T_predicted.inverse() @ T_matched).translation())
         error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
     with jax.named_scope("insert"):

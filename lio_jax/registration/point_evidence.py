@@ -31,7 +31,7 @@ def point_evidence(
     frame: Frame,
     lidar: BeamParams,
     registration: RobustFilterMatch,
-    moments: Float[Array, "k 10"] | None = None,
+    coordinates: Float[Array, "k 5"] | None = None,
 ) -> PointEvidence:
     """Return the statistics of the matched points at a pose, with the weights of the solve.
 
@@ -42,7 +42,7 @@ def point_evidence(
         frame: of the matches.
         lidar: the noise of ranges and directions.
         registration: the kernel, and how many points each counts as.
-        moments: of the matched voxels, by which the statistics have a derivative.
+        coordinates: of the matches, by which the statistics have a derivative.
     """
     kind, dtype = points.dtype, T_world_lidar.wxyz_xyz.dtype
     noise = point_noise(matches, points, T_world_lidar, frame, lidar)
@@ -54,7 +54,7 @@ def point_evidence(
         points,
         *frame.placing(T_world_lidar, kind),
         jnp.stack(point_variances(lidar, kind)),
-        moments,
+        coordinates,
         (matches, weight),
     ).astype(dtype)
     squared_error, log_det = sums
@@ -62,10 +62,10 @@ def point_evidence(
 
 
 def _rows(
-    arm: Array, shift: Array, scales: Array, moments: Array | None, constants: tuple[Matches, Array]
+    arm: Array, shift: Array, scales: Array, coordinates: Array | None, constants: tuple[Matches, Array]
 ) -> Array:
     matches, weight = constants
-    return _weighted(plane_noise(matches.following(moments), arm.T, shift, *scales), weight)
+    return _weighted(plane_noise(matches.at(coordinates), arm.T, shift, *scales), weight)
 
 
 def _weighted(noise: PointNoise, weight: Array) -> Array:

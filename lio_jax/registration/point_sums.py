@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lio_jax.core.implicit import with_derivative_of
+from lio_jax.core.xla import computed_once
 
 Rows = Callable[[Array, Array, Array, Any, Any], Array]
 """``(arm (3, k), shift (3,), scales (s,), met (k, j), constants) -> (m, k)``: what each point adds to m sums.
@@ -124,7 +125,8 @@ _PLACES[_PAIRS] = _PLACES.T[_PAIRS] = np.arange(28)
 def products(columns: list[Array], weight: Float[Array, " k"]) -> Float[Array, "28 k"]:
     """Return weight times column times column, for each pair of columns in the order of :func:`in_order`."""
     rows = jnp.stack(columns)
-    return (weight * rows)[_PAIRS[0]] * rows[_PAIRS[1]]
+    weighted, rows = computed_once((weight * rows, rows))
+    return weighted[_PAIRS[0]] * rows[_PAIRS[1]]
 
 
 def in_order(sums: Float[Array, "7 7"]) -> Float[Array, "28"]:

@@ -10,7 +10,7 @@ import jaxlie
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.geometry import normal_slope3
+from lio_jax.core.geometry import across, normal_slope3
 from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.xla import computed_once
 from lio_jax.lidar.params import BeamParams
@@ -18,7 +18,7 @@ from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.params import VoxelMapParams
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, mean_and_covariance, query_nearest
 from lio_jax.registration.params import RobustMatch
-from lio_jax.registration.point_sums import point_sums
+from lio_jax.registration.point_sums import as_matrix, in_order, point_sums, products
 from lio_jax.registration.scan_match import NormalEquations, ScanMatch
 
 
@@ -38,18 +38,29 @@ class Matches(eqx.Module):
     used: Bool[Array, " k"]
     """True where a point has a match."""
 
-    def moments_in(self, vmap: VoxelMap) -> Float[Array, "k 10"]:
-        """Return the moments of the voxels, by which the matches have a derivative."""
-        return vmap.moments.at[self.slot].get(mode="promise_in_bounds")
+    def coordinates_in(self, vmap: VoxelMap) -> Float[Array, "k 5"]:
+        """Return coordinates of the matches, by which they have a derivative, as functions of their voxels.
 
-    def following(self, moments: Float[Array, "k 10"] | None) -> "Matches":
-        """Return the same matches with their derivative by the moments; None: they are constants."""
-        if moments is None:
-            return self
+        They are two tilts of the plane (rad), its offset along its normal (m), and the two smaller variances
+        (m^2). The tilts and the offset are zero, but their derivative by the map's moments is not.
+        """
+        moments = vmap.moments.at[self.slot].get(mode="promise_in_bounds")
         held, normal = jax.lax.stop_gradient((moments, self.normal))
-        known = Surface(self.mean, normal, self.variances)
-        surface = with_derivative_of(known, surface_slope, held, normal, moments)
-        return replace(self, mean=surface.mean, normal=surface.normal, variances=surface.variances)
+        known = jnp.concatenate([jnp.zeros_like(self.normal), self.variances], -1)
+        return with_derivative_of(known, _coordinates, held, normal, moments)
+
+    def at(self, coordinates: Float[Array, "k 5"] | None) -> "Matches":
+        """Return the same matches as functions of :meth:`coordinates_in`; None: they are constants."""
+        if coordinates is None:
+            return self
+        normal = jax.lax.stop_gradient(self.normal)
+        tilts = zip(across(normal), coordinates[:, :2].T, strict=True)
+        return replace(
+            self,
+            mean=self.mean + coordinates[:, 2:3] * normal,
+            normal=normal + sum(angle[:, None] * direction for direction, angle in tilts),
+            variances=coordinates[:, 3:],
+        )
 
 
 def associate(
@@ -105,6 +116,26 @@ def surface_slope(
     second = _symmetric(change[:, 4:7] / count, change[:, 7:10] / count)
     dA = second - both - jnp.swapaxes(both, 1, 2)
     return Surface(moved, *normal_slope3(_symmetric(diagonal, off_diagonal), normal, dA))
+
+
+def _coordinates(
+    held: Float[Array, "k 10"], normal: Float[Array, "k 3"], moments: Float[Array, "k 10"]
+) -> Array:
+    """Return a linear function of the moments whose slope is that of :meth:`Matches.coordinates_in`.
+
+    The slope is worked out by each of the nine moments that have an effect, once for all tangents.
+    """
+    first, second = across(normal)
+
+    def along(unit: Array) -> Array:
+        change = surface_slope(held, normal, jnp.broadcast_to(unit, held.shape))
+        components = ((change.normal, first), (change.normal, second), (change.mean, normal))
+        moved = [jnp.sum(of * axis, -1) for of, axis in components]
+        return jnp.stack([*moved, *change.variances.T], -1)
+
+    slopes = computed_once(jnp.moveaxis(jax.vmap(along)(jnp.eye(10, dtype=held.dtype)[1:]), -1, 1))
+    columns = zip(slopes, moments.T[1:], strict=True)
+    return sum((slope * moment for slope, moment in columns), jnp.zeros_like(slopes[0])).T
 
 
 def _symmetric(diagonal: Float[Array, "k 3"], off_diagonal: Float[Array, "k 3"]) -> Array:
@@ -183,11 +214,11 @@ def linearise(
     frame: Frame,
     kernel: Float[Array, ""],
     lidar: BeamParams,
-    moments: Float[Array, "k 10"] | None = None,
+    coordinates: Float[Array, "k 5"] | None = None,
 ) -> NormalEquations:
     """Return the robustly weighted normal equations of associated points at a pose.
 
-    ``moments`` are those of the matched voxels, by which the equations have a derivative.
+    ``coordinates`` are those of the matches, by which the equations have a derivative.
 
     Robust weight: Geman-McClure on s sqrt(k) n'e, the noise-scaled distance in m of a point at offset e from
     its plane's mean, with precision k and s^2 of range and surface.
@@ -212,20 +243,22 @@ def linearise(
     scalars = [matched, weight, weight * noise.scaled_squared, matched * jnp.sum(arm**2, -1)]
     weighted = jnp.concatenate([(weight * noise.precision)[:, None] * row, jnp.stack(scalars, -1)], -1)
     sums = jax.lax.stop_gradient(row.T @ weighted)
+    count, squares = sums[7, 8], sums[:7, :7].astype(dtype)
+    squares = squares.at[:6, :6].set((squares[:6, :6] + squares[:6, :6].T) / 2)
     total = point_sums(
-        jnp.concatenate([sums[:6, :6].ravel(), sums[:6, 6], sums[7, 9:]]),
+        jnp.concatenate([in_order(squares)[:-1], sums[7, 9:].astype(dtype)]),
         _rows,
         points,
         *frame.placing(T_world_lidar, kind),
         jnp.stack([*point_variances(lidar, kind), kernel.astype(kind)]),
-        moments,
+        coordinates,
         matches,
-    ).astype(dtype)
-    hessian, count = total[:36].reshape(6, 6), sums[7, 8]
-    weight_sum, squared_error, arm_squared = total[42:]
+    )
+    weight_sum, squared_error, arm_squared = total[27:]
+    equations = as_matrix(total[:28])[:6]
     return NormalEquations(
-        hessian=(hessian + hessian.T) / 2,
-        gradient=total[36:42],
+        hessian=equations[:, :6],
+        gradient=equations[:, 6],
         matches=count.astype(jnp.int32),
         weight=weight_sum,
         squared_error=squared_error,
@@ -233,20 +266,17 @@ def linearise(
     )
 
 
-def _rows(arm: Array, shift: Array, scales: Array, moments: Array | None, matches: Matches) -> Array:
+def _rows(arm: Array, shift: Array, scales: Array, coordinates: Array | None, matches: Matches) -> Array:
     """Return what each point adds to the sums of :func:`linearise`."""
     facing, turning, kernel = scales
-    matches = matches.following(moments)
+    matches = matches.at(coordinates)
     noise = plane_noise(matches, arm.T, shift, facing, turning)
     weight = noise.weight(kernel)
-    believed = weight * noise.precision
-    jacobian = jnp.concatenate([jnp.cross(noise.arm, matches.normal), matches.normal], -1).T
-    jacobian, scaled = computed_once((jacobian, believed * jacobian))
+    columns = [*jnp.cross(noise.arm, matches.normal).T, *matches.normal.T, noise.distance]
     arm_squared = jnp.where(matches.used, jnp.sum(noise.arm**2, -1), 0.0)
     return jnp.concatenate(
         [
-            (scaled[:, None] * jacobian).reshape(36, -1),
-            noise.distance * scaled,
+            products(columns, weight * noise.precision)[:-1],
             jnp.stack([weight, weight * noise.scaled_squared, arm_squared]),
         ]
     )
@@ -283,8 +313,8 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
     ) -> NormalEquations:
         kernel = self.registration.kernel + self.opening(iteration)
         points = self.points_at(T_world_lidar)
-        moments = found.moments_in(self.map)
-        return linearise(found, points, T_world_lidar, self.frame(), kernel, self.lidar, moments)
+        coordinates = found.coordinates_in(self.map)
+        return linearise(found, points, T_world_lidar, self.frame(), kernel, self.lidar, coordinates)
 
     def settled(self, iteration: Int32[Array, ""]) -> Bool[Array, ""]:
         return self.opening(iteration) < self.registration.kernel
