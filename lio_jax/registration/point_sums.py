@@ -117,7 +117,7 @@ def distance_columns(arm: _Axes, placed: _Axes, normal: _Axes, offset: Float[Arr
     return [ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx, nx, ny, nz, distance]
 
 
-_PAIRS = np.triu_indices(7)
+_PAIRS = tuple(place.astype(np.int32) for place in np.triu_indices(7))
 _PLACES = np.zeros((7, 7), np.int32)
 _PLACES[_PAIRS] = _PLACES.T[_PAIRS] = np.arange(28)
 
