@@ -79,8 +79,8 @@ def _summed_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
     def slopes(by: int) -> Array:
         """Return the rows' derivatives by each component of one of their arguments."""
-        shape = arguments[by].shape
-        units = jnp.eye(shape[1 if by == 3 else 0], dtype=points.dtype)
+        shape, dtype = arguments[by].shape, arguments[by].dtype
+        units = jnp.eye(shape[1 if by == 3 else 0], dtype=dtype)
         spread = {0: units[:, :, None], 3: units[:, None, :]}.get(by, units)
         return jax.vmap(partial(along, by))(jnp.broadcast_to(spread, (len(units), *shape)))
 

@@ -45,8 +45,8 @@ class Matches(eqx.Module):
         (m^2). The tilts and the offset are zero, but their derivative by the map's moments is not.
         """
         moments = vmap.moments.at[self.slot].get(mode="promise_in_bounds")
-        held, normal = jax.lax.stop_gradient((moments, self.normal))
-        known = jnp.concatenate([jnp.zeros_like(self.normal), self.variances], -1)
+        held, normal, variances = jax.lax.stop_gradient((moments, self.normal, self.variances))
+        known = jnp.concatenate([jnp.zeros_like(normal), variances], -1)
         return with_derivative_of(known, _coordinates, held, normal, moments)
 
     def at(self, coordinates: Float[Array, "k 5"] | None) -> "Matches":
