@@ -2,10 +2,12 @@
 mean."""
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jaxlie
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from lio_jax.core.error_state import (
@@ -22,6 +24,7 @@ from lio_jax.core.error_state import (
     sphere_basis,
 )
 from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
+from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.prefix_sum import prefix_sum
 from lio_jax.core.types import ImuBatch, NavState
 from lio_jax.imu.discretise import discretise, process_noise
@@ -149,30 +152,105 @@ def propagate_sweep(
         over the sweep; and the path from ``start`` to ``end``.
     """
     nav = state.nav
-    intervals, shift = jax.jvp(
-        lambda offset: sample_intervals(imu, offset, start, end),
-        (nav.time_offset,),
-        (jnp.ones_like(nav.time_offset),),
-    )
+    intervals, shift = _intervals_and_shift(imu, nav.time_offset, start, end)
     increments, path = _follow(nav, intervals, start)
     last = jaxlie.SE3(path.T_world_imu.wxyz_xyz[-1])
     moved = dataclasses.replace(nav, T_world_imu=last, velocity=path.velocity[-1])
 
-    effect = sensitivity(increments, intervals.duration, path.rate, path.accel)
-    middle = (path.time[:-1] + path.time[1:]) / 2
+    motion = _Motion(intervals, shift, path.rate, path.accel, increments)
+    measured = _Measured(nav.gyro_bias, nav.accel_bias, nav.time_offset, params)
+    span = imu, start, end, sweep_start
+    held = jax.lax.stop_gradient((measured, span))
+    known = _effects_of(jax.lax.stop_gradient(motion), held[0].noise, *held[1][1:])
+    effects = with_derivative_of(known, _linear_effects, measured, held[0], span)
+
+    shown = still_to_show(start, sweep_start, end)
+    transition = _transition(nav, increments, path.gravity, effects.by_bias, effects.by_offset, shown)
+    covariance = transition @ state.covariance @ transition.T + _placed(effects.noise)
+    return SweptState(moved, (covariance + covariance.T) / 2), path
+
+
+class _Motion(NamedTuple):
+    """The motion in each interval of a span."""
+
+    intervals: Intervals
+    shift: Intervals
+    """Derivative of the intervals by the time offset."""
+    rate: Float[Array, "n 3"]
+    """Without bias, rad/s, IMU frame."""
+    accel: Float[Array, "n 3"]
+    """Without bias, m/s^2, IMU frame."""
+    increments: Increments
+
+
+class _Measured(NamedTuple):
+    """What the effects of a span's samples depend on, beside the samples."""
+
+    gyro_bias: Float[Array, "3"]
+    accel_bias: Float[Array, "3"]
+    time_offset: Float[Array, ""]
+    noise: ImuParams
+
+
+class _Effects(NamedTuple):
+    """What errors of the samples lead to: rotation (rad), position (m) and velocity (m/s) at the span's end,
+    then ``LAG``."""
+
+    noise: Float[Array, "21 21"]
+    """Covariance of these, and of the change of both biases."""
+    by_bias: Float[Array, "15 6"]
+    """Derivative by the biases."""
+    by_offset: Float[Array, "15"]
+    """Derivative by the time offset."""
+
+
+def _effects_of(motion: _Motion, noise: ImuParams, start: Array, end: Array, sweep_start: Array) -> _Effects:
+    intervals, shift, rate, accel, increments = motion
+    effect = sensitivity(increments, intervals.duration, rate, accel)
+    knots = start + increments.time
+    middle = (knots[:-1] + knots[1:]) / 2
     lag_inputs = lag_of_inputs(effect, middle, sweep_start, end)
     inputs = jnp.concatenate([effect.inputs, lag_inputs], axis=1)
     signal = jnp.concatenate([shift.gyro, shift.accel], axis=1)
-    lag_by_offset = lag_of_durations(effect, shift.duration, path.time, sweep_start, end)
+    lag_by_offset = lag_of_durations(effect, shift.duration, knots, sweep_start, end)
     moved_knots = jnp.concatenate([shift.duration @ effect.duration, lag_by_offset])
-    by_offset = jnp.einsum("nij,nj->i", inputs, signal) + moved_knots
-    by_bias = jnp.where(intervals.measured, -jnp.sum(inputs, axis=0), 0.0)
-    shown = still_to_show(start, sweep_start, end)
-    transition = _transition(nav, increments, path.gravity, by_bias, by_offset, shown)
-    noise = discretise(params, intervals.duration, intervals.gap, intervals.known)
-    added = process_noise(inputs, noise, intervals.measured)
-    covariance = transition @ state.covariance @ transition.T + _placed(added)
-    return SweptState(moved, (covariance + covariance.T) / 2), path
+    each = discretise(noise, intervals.duration, intervals.gap, intervals.known)
+    return _Effects(
+        noise=process_noise(inputs, each, intervals.measured),
+        by_bias=jnp.where(intervals.measured, -jnp.sum(inputs, axis=0), 0.0),
+        by_offset=jnp.einsum("nij,nj->i", inputs, signal) + moved_knots,
+    )
+
+
+def _linear_effects(measured: _Measured, held: _Measured, span: tuple) -> _Effects:
+    """Return the effects as a linear function of ``measured`` around the same values.
+
+    The slope by each of its few numbers is worked out once, so the cost grows little with the number of
+    tangents.
+    """
+    at, numbers = ravel_pytree(held)
+
+    def effects(x: Array) -> _Effects:
+        gyro_bias, accel_bias, time_offset, noise = numbers(x)
+        intervals, shift = _intervals_and_shift(span[0], time_offset, *span[1:3])
+        rate, accel = _without_bias(intervals, gyro_bias, accel_bias)
+        increments = accumulate(intervals.duration, rate, accel)
+        return _effects_of(_Motion(intervals, shift, rate, accel, increments), noise, *span[1:])
+
+    slopes = jax.vmap(lambda unit: jax.jvp(effects, (at,), (unit,))[1])(jnp.eye(len(at), dtype=at.dtype))
+    moved = ravel_pytree(measured)[0] - at
+    return jax.tree.map(lambda value, slope: value + jnp.tensordot(moved, slope, 1), effects(at), slopes)
+
+
+def _intervals_and_shift(
+    imu: ImuBatch, time_offset: Array, start: Array, end: Array
+) -> tuple[Intervals, Intervals]:
+    """Return the intervals of a span, and their derivative by the time offset."""
+    return jax.jvp(
+        lambda offset: sample_intervals(imu, offset, start, end),
+        (time_offset,),
+        (jnp.ones_like(time_offset),),
+    )
 
 
 def path_along(nav: NavState, imu: ImuBatch, start: Float[Array, ""], end: Float[Array, ""]) -> Path:
@@ -188,11 +266,9 @@ def path_along(nav: NavState, imu: ImuBatch, start: Float[Array, ""], end: Float
 
 
 def _follow(nav: NavState, intervals: Intervals, start: Float[Array, ""]) -> tuple[Increments, Path]:
+    rate, accel = _without_bias(intervals, nav.gyro_bias, nav.accel_bias)
     # constant velocity where nothing is measured, so gravity must have no effect either
-    measured = intervals.measured
-    rate = jnp.where(measured, intervals.gyro - nav.gyro_bias, 0.0)
-    accel = jnp.where(measured, intervals.accel - nav.accel_bias, 0.0)
-    gravity = jnp.where(measured, nav.gravity, 0.0)
+    gravity = jnp.where(intervals.measured, nav.gravity, 0.0)
     increments = accumulate(intervals.duration, rate, accel)
     rotation = nav.T_world_imu.rotation()
     matrix = rotation_matrix(rotation)
@@ -209,6 +285,12 @@ def _follow(nav: NavState, intervals: Intervals, start: Float[Array, ""]) -> tup
         gravity=gravity,
     )
     return increments, path
+
+
+def _without_bias(intervals: Intervals, gyro_bias: Array, accel_bias: Array) -> tuple[Array, Array]:
+    measured = intervals.measured
+    rate = jnp.where(measured, intervals.gyro - gyro_bias, 0.0)
+    return rate, jnp.where(measured, intervals.accel - accel_bias, 0.0)
 
 
 def _transition(

@@ -6,6 +6,7 @@ a whole number of voxels, such that the vehicle is near the origin.
 """
 
 from collections.abc import Callable
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -19,6 +20,8 @@ from lio_jax.core.hashing import voxel_hash
 from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.prefix_sum import running_count
 from lio_jax.core.xla import computed_once
+
+_Tree = TypeVar("_Tree")
 
 WAYS = 2
 """Number of slots that a voxel may lie in. They are neighbours in memory, so that both are read together."""
@@ -254,33 +257,88 @@ def _moments_after(
     order = jnp.arange(count, dtype=jnp.int32)
     fresh = mask & (slot >= 0) & jnp.any(_take(old, held) != voxel, axis=1)
     # of all points of a fresh voxel one takes away what its slot held before
+    fresh &= _take(old, (held, 0)) != FREE
     first = jnp.full(capacity, count, jnp.int32).at[jnp.where(fresh, slot, capacity)].min(order, mode="drop")
     clears = fresh & (_take(first, held) == order)
     touched = clears | added
-    total = jnp.sum(touched)
+    total = jnp.sum(touched, dtype=jnp.int32)
     size = min(_CHUNK, count)
     padded = -(-count // size) * size
     place = jnp.where(touched, running_count(touched) - 1, padded)
     rows = computed_once(jnp.zeros(padded, jnp.int32).at[place].set(order, mode="drop"))
+    slots, clearing = _take(held, rows), _take(clears, rows)
 
-    def changes(some: Array) -> Array:
+    def gained(some: Array) -> Array:
         # the module is an argument, because its arrays have a derivative
         again = with_derivative_of(
             _take(points, some), lambda place, rows: place(rows).astype(dtype), placed_again, some
         )
         _, _, offset = grid.places(again)
-        gains = jnp.where(_take(added, some)[:, None], _moment_row(offset), 0.0)
-        loses = jnp.where(_take(clears, some)[:, None], _take(before, _take(held, some)), 0.0)
-        return gains - loses
+        return jnp.where(_take(added, some)[:, None], _moment_row(offset), 0.0)
 
     def chunk(number: Array) -> Array:
         some = jax.lax.dynamic_slice(rows, (number * size,), (size,))
-        return jax.lax.cond(number * size < total, changes, lambda rows: jnp.zeros((size, 10), dtype), some)
+        return jax.lax.cond(number * size < total, gained, lambda rows: jnp.zeros((size, 10), dtype), some)
 
-    # a single addition, outside of branches and loops: only then XLA writes into the table where it lies
-    change = jax.lax.map(chunk, jnp.arange(padded // size)).reshape(padded, 10)
-    target = jnp.where(jnp.arange(padded) < total, _take(held, rows), capacity)
-    return before.at[target].add(change, mode="drop")
+    def lost(before: Array) -> Array:
+        return jnp.where(clearing[:, None], _take(before, slots), 0.0)
+
+    gains = jax.lax.map(chunk, jnp.arange(padded // size)).reshape(padded, 10)
+    # few scans overwrite voxels
+    losses = jax.lax.cond(jnp.any(clears), lost, lambda before: jnp.zeros((padded, 10), dtype), before)
+    return _added_at(before, slots, gains - losses, total)
+
+
+def _added_at(
+    table: Float[Array, "c w"],
+    slots: Int32[Array, " n"],
+    change: Float[Array, "n w"],
+    total: Int32[Array, ""],
+) -> Float[Array, "c w"]:
+    """Return the table with the first ``total`` rows of ``change`` added at their slots.
+
+    The table is written where it lies, in as many pieces as there are changes, both here and in the
+    transposed function. To JAX this is the solution (table + S change, change) of a linear system, because a
+    loop whose length is not known in advance can't be transposed otherwise.
+    """
+    size = min(_CHUNK // 4, len(slots))
+
+    def in_pieces(start: _Tree, piece: Callable[[Array, Array, _Tree], _Tree]) -> _Tree:
+        def body(number: Array, carry: _Tree) -> _Tree:
+            first = jnp.minimum(number * size, len(slots) - size)
+            some = first + jnp.arange(size, dtype=jnp.int32)
+            mine = (some >= number * size) & (some < total)
+            return piece(first, jnp.where(mine, _take(slots, some), len(table)), carry)
+
+        return jax.lax.fori_loop(0, (total + size - 1) // size, body, start)
+
+    def system(unknown: tuple[Array, Array]) -> tuple[Array, Array]:
+        after, change = unknown
+        held = jnp.where(jnp.arange(len(slots)) < total, slots, len(table))
+        return after.at[held].add(-change, mode="drop"), change
+
+    def solve(_: Any, right: tuple[Array, Array]) -> tuple[Array, Array]:
+        change = right[1]
+
+        def add(first: Array, held: Array, table: Array) -> Array:
+            return table.at[held].add(jax.lax.dynamic_slice_in_dim(change, first, size), mode="drop")
+
+        return in_pieces(right[0], add), change
+
+    def solve_transposed(_: Any, right: tuple[Array, Array]) -> tuple[Array, Array]:
+        after = right[0]
+
+        def add(first: Array, held: Array, change: Array) -> Array:
+            more = jax.lax.dynamic_slice_in_dim(change, first, size)
+            more += after.at[held].get(mode="fill", fill_value=0.0)
+            return jax.lax.dynamic_update_slice_in_dim(change, more, first, 0)
+
+        return after, in_pieces(right[1], add)
+
+    # JAX differentiates and transposes the solution only if neither half is constant or unused
+    table = table.at[0].add(0 * change[0])
+    after, same = jax.lax.custom_linear_solve(system, (table, change), solve, solve_transposed)
+    return after.at[0].add(0 * same[0])
 
 
 def _moment_row(offset: Float[Array, "m 3"]) -> Float[Array, "m 10"]:
