@@ -207,6 +207,7 @@ def registration_of(update: Update, T_world_lidar: jaxlie.SE3) -> Registration:
         degenerate=last.degenerate,
         matches=last.equations.matches,
         rmse=last.equations.rmse(),
+        blur=last.equations.blur,
         iterations=update.iterations,
         status=update.status,
     )

@@ -31,6 +31,8 @@ class Registration(eqx.Module):
     """Points that found a distribution in the map."""
     rmse: Float[Array, ""]
     """Robustly weighted root mean square distance to the map, m."""
+    blur: Float[Array, ""]
+    """Mean squared distance of the points from the map, robust, as a share of their squared ranges."""
     iterations: Int32[Array, ""]
     """Number of Gauss-Newton steps."""
     status: Int32[Array, ""]
@@ -184,6 +186,7 @@ def _registration_at(
         degenerate=end.directions.degenerate,
         matches=equations.matches,
         rmse=equations.rmse(),
+        blur=equations.blur,
         iterations=end.iterations,
         status=status.astype(jnp.int32),
     )

@@ -20,7 +20,7 @@ from lio_jax.mapping.params import MapParams
 from lio_jax.mapping.point_map import PointMap
 from lio_jax.registration.params import KnnParams, ScoredFitParams
 from lio_jax.registration.point_sums import as_matrix, distance_columns, in_order, point_sums, products
-from lio_jax.registration.scan_match import NormalEquations, ScanMatch
+from lio_jax.registration.scan_match import NormalEquations, ScanMatch, relative_blur
 
 _Coordinates = Float[Array, "n k"]
 """One coordinate of n points in each of k columns."""
@@ -270,13 +270,15 @@ def linearise(
     ).astype(dtype)
     sums = as_matrix(total[:-1])
     precision = 1 / lidar.range_sigma**2
+    arm_squared = total[-1] / jnp.maximum(count, 1.0)
     return NormalEquations(
         hessian=precision * sums[:6, :6],
         gradient=precision * sums[:6, 6],
         matches=count.astype(jnp.int32),
         weight=count,
         squared_error=sums[6, 6],
-        arm_squared=total[-1] / jnp.maximum(count, 1.0),
+        arm_squared=arm_squared,
+        blur=relative_blur(sums[6, 6], count, arm_squared),
     )
 
 

@@ -32,7 +32,7 @@ from lio_jax.registration.knn_planes import (
 )
 from lio_jax.registration.params import LineFitParams, ScoredFitParams
 from lio_jax.registration.point_sums import as_matrix, distance_columns, in_order, point_sums, products
-from lio_jax.registration.scan_match import NormalEquations
+from lio_jax.registration.scan_match import NormalEquations, relative_blur
 
 _Coordinates = Float[Array, "n k"]
 """One coordinate of n points in each of k columns."""
@@ -287,13 +287,15 @@ def linearise(
     products, (weight, squared_ranges) = as_matrix(total[:-2]), total[-2:]
     count = (jnp.sum(lines.first.valid) + jnp.sum(planes.valid)).astype(jnp.int32)
     precision = 1 / range_sigma**2
+    arm_squared = squared_ranges / jnp.maximum(count, 1).astype(dtype)
     return NormalEquations(
         hessian=precision * products[:6, :6],
         gradient=precision * products[:6, 6],
         matches=count,
         weight=weight,
         squared_error=products[6, 6],
-        arm_squared=squared_ranges / jnp.maximum(count, 1).astype(dtype),
+        arm_squared=arm_squared,
+        blur=relative_blur(products[6, 6], weight, arm_squared),
     )
 
 

@@ -83,18 +83,35 @@ class NormalEquations(eqx.Module):
     """Robustly weighted sum of squared distances, m^2."""
     arm_squared: Float[Array, ""]
     """Mean squared distance of the points from the sensor, m^2: scales rotations to metres."""
+    blur: Float[Array, ""]
+    """Mean squared distance of the points from the map, robust, as a share of their squared ranges; 0 without
+    matches."""
 
     @staticmethod
     def nothing(dtype: jnp.dtype) -> "NormalEquations":
         """Return the equations of no points."""
         zero = jnp.zeros((), dtype)
-        return NormalEquations(jnp.zeros((6, 6), dtype), jnp.zeros(6, dtype), jnp.int32(0), zero, zero, zero)
+        return NormalEquations(jnp.zeros((6, 6), dtype), jnp.zeros(6, dtype), jnp.int32(0), *[zero] * 4)
 
     def rmse(self) -> Float[Array, ""]:
         """Return the robustly weighted root mean square distance to the map, m; 0 without matches."""
         some = (self.weight > 0) & (self.squared_error > 0)
         mean = jnp.where(some, self.squared_error, 1.0) / jnp.where(some, self.weight, 1.0)
         return jnp.where(some, jnp.sqrt(mean), 0.0)
+
+
+def relative_blur(
+    squared_error: Float[Array, ""], weight: Float[Array, ""], arm_squared: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Return the mean squared distance as a share of the mean squared range; 0 without matches.
+
+    Args:
+        squared_error: weighted sum of squared distances, m^2.
+        weight: sum of the weights.
+        arm_squared: mean squared range, m^2.
+    """
+    some = (weight > 0) & (arm_squared > 0)
+    return jnp.where(some, squared_error, 0.0) / jnp.where(some, weight * arm_squared, 1.0)
 
 
 class FixedPoints(eqx.Module, Generic[_Points]):

@@ -143,6 +143,10 @@ def _symmetric(diagonal: Float[Array, "k 3"], off_diagonal: Float[Array, "k 3"])
     return jnp.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
 
 
+_BLUR_KERNEL = 0.5
+"""Scale of the kernel of :meth:`PointNoise.blur` in standard deviations of a distance."""
+
+
 class PointNoise(eqx.Module):
     """Each matched point's distance from its plane and the noise of that distance."""
 
@@ -160,6 +164,19 @@ class PointNoise(eqx.Module):
     def weight(self, kernel: Float[Array, ""]) -> Float[Array, " k"]:
         """Return the Geman-McClure weights of the noise-scaled distances, zero where there is no match."""
         return jnp.where(self.precision > 0, (kernel**2 / (kernel**2 + self.scaled_squared)) ** 2, 0.0)
+
+    def blur(self, facing: Float[Array, ""]) -> Float[Array, " k"]:
+        """Return the Geman-McClure losses of the distances, m^2, with a kernel as narrow as their noise.
+
+        The registration's kernel is wider, so that a wrong prediction finds the map. Through it, edges and
+        plants add to the blur. Their distances are smaller in a smaller world, which would favour ranges that
+        are too short.
+
+        Args:
+            facing: variance of a point along its plane's normal, m^2.
+        """
+        wide = _BLUR_KERNEL**2 * facing
+        return jnp.where(self.precision > 0, wide * self.scaled_squared / (wide + self.scaled_squared), 0.0)
 
 
 def point_noise(
@@ -240,7 +257,10 @@ def linearise(
         -1,
     )
     matched = matches.used.astype(kind)
-    scalars = [matched, weight, weight * noise.scaled_squared, matched * jnp.sum(arm**2, -1)]
+    facing, turning = point_variances(lidar, kind)
+    arm_squared = matched * jnp.sum(arm**2, -1)
+    scalars = [matched, weight, weight * noise.scaled_squared, arm_squared]
+    scalars += [noise.blur(facing), _log_or_zero(arm_squared)]
     weighted = jnp.concatenate([(weight * noise.precision)[:, None] * row, jnp.stack(scalars, -1)], -1)
     sums = jax.lax.stop_gradient(row.T @ weighted)
     count, squares = sums[7, 8], sums[:7, :7].astype(dtype)
@@ -250,11 +270,12 @@ def linearise(
         _rows,
         points,
         *frame.placing(T_world_lidar, kind),
-        jnp.stack([*point_variances(lidar, kind), kernel.astype(kind)]),
+        jnp.stack([facing, turning, kernel.astype(kind)]),
         coordinates,
         matches,
     )
-    weight_sum, squared_error, arm_squared = total[27:]
+    weight_sum, squared_error, arm_squared, loss, log_squares = total[27:]
+    matched_points = jnp.maximum(count, 1.0).astype(dtype)
     equations = as_matrix(total[:28])[:6]
     return NormalEquations(
         hessian=equations[:, :6],
@@ -262,7 +283,9 @@ def linearise(
         matches=count.astype(jnp.int32),
         weight=weight_sum,
         squared_error=squared_error,
-        arm_squared=arm_squared / jnp.maximum(count, 1.0).astype(dtype),
+        arm_squared=arm_squared / matched_points,
+        # the geometric mean of the ranges, of which near points change as much as far ones
+        blur=loss / matched_points * jnp.exp(-log_squares / matched_points),
     )
 
 
@@ -278,8 +301,14 @@ def _rows(arm: Array, shift: Array, scales: Array, coordinates: Array | None, ma
         [
             products(columns, weight * noise.precision)[:-1],
             jnp.stack([weight, weight * noise.scaled_squared, arm_squared]),
+            jnp.stack([noise.blur(facing), _log_or_zero(arm_squared)]),
         ]
     )
+
+
+def _log_or_zero(squares: Float[Array, " k"]) -> Float[Array, " k"]:
+    positive = squares > 0
+    return jnp.where(positive, jnp.log(jnp.where(positive, squares, 1.0)), 0.0)
 
 
 class ScanToVoxels(ScanMatch[Array, Matches]):

@@ -36,6 +36,8 @@ class Observed(eqx.Module):
     """At the scan's end."""
     rmse: Float[Array, ""]
     """Robustly weighted root mean square distance of the scan to the map, m."""
+    blur: Float[Array, ""]
+    """Mean squared distance of the scan from the map, robust, as a share of the squared ranges."""
     status: Int32[Array, ""]
     """Status code of the solve, see :mod:`lio_jax.core.types`."""
     lost: Bool[Array, ""]
@@ -57,6 +59,7 @@ class Observed(eqx.Module):
         return Observed(
             nav=state.nav,
             rmse=result.rmse,
+            blur=result.blur,
             status=result.status,
             lost=output.lost,
             covariance=output.covariance,
@@ -235,11 +238,12 @@ def range_noise(seen: Observed, truth: TruePose) -> Float[Array, ""]:
 
 
 def map_consistency(seen: Observed, truth: TruePose) -> Float[Array, ""]:
-    """Return the mean squared distance of the scan from the map, m^2: blur of the map, in other words.
+    """Return the blur of the map: the mean squared distance of the scan from it, relative to ranges, mrad^2.
 
-    It tells of what distorts scans, such as extrinsics and time offset, not of noise densities.
+    It tells of what distorts scans, such as extrinsics and time offset, not of noise densities. Relative to
+    ranges, because a smaller world has smaller distances.
     """
-    return seen.rmse**2
+    return 1e6 * seen.blur
 
 
 def _evidence(seen: Observed) -> Evidence:

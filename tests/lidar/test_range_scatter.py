@@ -113,7 +113,9 @@ def test_the_range_noise_is_found_among_poles(sigma, start):
     def slope_and_curvature(logarithm):
         def loss(logarithm):
             lidar = dataclasses.replace(PARAMS.lidar, range_sigma=jnp.exp(logarithm))
-            seen = Observed(nav, jnp.array(0.1), jnp.int32(0), jnp.array(False), None, None, None)
+            seen = Observed(
+                nav, jnp.array(0.1), jnp.array(1e-6), jnp.int32(0), jnp.array(False), None, None, None
+            )
             return range_noise(seen.with_scan(scan, dataclasses.replace(PARAMS, lidar=lidar)), truth)
 
         return jax.grad(loss)(logarithm), jax.hessian(loss)(logarithm)

@@ -16,6 +16,7 @@ PICTURES = {
     "03_gradient_and_tuning": 2,
     "04_ablation": 1,
     "05_your_own_bag": 2,
+    "06_calibrate_a_lidar": 2,
 }
 
 

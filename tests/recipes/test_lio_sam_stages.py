@@ -125,6 +125,7 @@ def match(T_world_imu, used=True, lost=False, new_piece=False) -> MapMatch:
         degenerate=jnp.zeros(6, bool),
         matches=jnp.int32(500),
         rmse=jnp.asarray(0.01),
+        blur=jnp.asarray(1e-6),
         iterations=jnp.int32(3),
         status=jnp.int32(LOST if lost else CONVERGED),
     )

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.voxel_map import anchor_of, empty_map, insert
-from lio_jax.registration.scan_match import NormalEquations
+from lio_jax.registration.scan_match import NormalEquations, relative_blur
 from lio_jax.registration.voxel_planes import associate, linearise
 from tests.registration.scenes import map_of, matrix, params_with, pose
 
@@ -198,6 +198,36 @@ def test_sums_are_those_of_the_matched_points(kernel):
     np.testing.assert_allclose(found.weight, robust.sum(), rtol=1e-4)
     np.testing.assert_allclose(found.squared_error, (robust * squared).sum(), rtol=1e-3)
     np.testing.assert_allclose(found.arm_squared, (points.astype(float) ** 2).sum(1).mean(), rtol=1e-5)
+
+
+def blur(points, patch, T) -> float:
+    """Return the mean loss with a kernel of half the noise, over the geometric mean of the squared ranges."""
+    squared, wide = squared_distances(points, patch, T), (SIGMA / 2) ** 2
+    ranges = np.linalg.norm(points.astype(float), axis=1)
+    return float(np.mean(wide * squared / (wide + squared)) / np.exp(2 * np.mean(np.log(ranges))))
+
+
+def test_blur_is_the_narrow_loss_relative_to_the_ranges_and_so_is_its_derivative():
+    points, patch = scan(400, 0.1)
+    np.testing.assert_allclose(equations(points).blur, blur(points, patch, matrix(TRUTH)), rtol=1e-4)
+
+    def lengthened(metres):
+        distances = np.linalg.norm(points.astype(float), axis=1)[:, None]
+        return points * (1 + metres / distances)
+
+    ranges = jnp.linalg.norm(points, axis=1, keepdims=True)
+    outward = (jnp.asarray(points / ranges),)
+    _, slope = jax.jvp(lambda points: equations(points).blur, (jnp.asarray(points),), outward)
+    ends = [blur(lengthened(step), patch, matrix(TRUTH)) for step in (-1e-5, 1e-5)]
+    np.testing.assert_allclose(slope, (ends[1] - ends[0]) / 2e-5, rtol=1e-2)
+
+
+def test_blur_does_not_depend_on_the_size_of_the_world():
+    error, weight, arm = jnp.asarray(0.3), jnp.asarray(40.0), jnp.asarray(90.0)
+    small, large = relative_blur(error, weight, arm), relative_blur(4 * error, weight, 4 * arm)
+    assert small > 0
+    assert large == pytest.approx(float(small))
+    assert relative_blur(error, 0 * weight, arm) == 0
 
 
 def test_the_shape_of_a_voxel_decides_what_it_measures():

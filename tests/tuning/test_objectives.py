@@ -40,7 +40,7 @@ def poses(seed, noise=0.0):
 def seen_at(pose, lost=False):
     nav = initial_nav_state(jaxlie.SE3.identity())
     nav = dataclasses.replace(nav, T_world_imu=jaxlie.SE3(pose))
-    return Observed(nav, jnp.array(0.1), jnp.int32(0), jnp.array(lost), None, None, None)
+    return Observed(nav, jnp.array(0.1), jnp.array(1e-6), jnp.int32(0), jnp.array(lost), None, None, None)
 
 
 def loss(objective, estimate, truth, known=None):
