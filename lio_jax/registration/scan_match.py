@@ -163,7 +163,7 @@ class ScanMatch(eqx.Module, Generic[_Points, _Found]):
         """
 
     def settled(self, iteration: Int32[Array, ""]) -> Bool[Array, ""]:
-        """Return whether the robust kernel has nearly its own width, so that the solve may end."""
+        """Return whether the robust kernel has its own scale, so that the solve may end."""
         return jnp.array(True)
 
     def start(self) -> Association[_Found]:

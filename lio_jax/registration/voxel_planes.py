@@ -316,7 +316,8 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
 
     The kernel starts as wide as the prediction may be wrong and halves with each iteration down to its own
     scale, so that a scan without a velocity prior still finds the map (graduated non-convexity, Blake &
-    Zisserman 1987).
+    Zisserman 1987). The solve ends only at the kernel's own scale, so the solution does not depend on the
+    number of iterations.
     """
 
     registration: RobustMatch
@@ -340,16 +341,16 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
     def linearise(
         self, T_world_lidar: jaxlie.SE3, found: Matches, iteration: Int32[Array, ""]
     ) -> NormalEquations:
-        kernel = self.registration.kernel + self.opening(iteration)
+        kernel = jnp.maximum(self.registration.kernel, self.opening(iteration))
         points = self.points_at(T_world_lidar)
         coordinates = found.coordinates_in(self.map)
         return linearise(found, points, T_world_lidar, self.frame(), kernel, self.lidar, coordinates)
 
     def settled(self, iteration: Int32[Array, ""]) -> Bool[Array, ""]:
-        return self.opening(iteration) < self.registration.kernel
+        return self.opening(iteration) <= self.registration.kernel
 
     def opening(self, iteration: Int32[Array, ""]) -> Float[Array, ""]:
-        """Return by how much the kernel is still open, m."""
+        """Return the least scale of the kernel at an iteration, m."""
         return self.prediction_error * 0.5 ** iteration.astype(self.prediction_error.dtype)
 
     def frame(self) -> Frame:

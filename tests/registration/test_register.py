@@ -93,6 +93,14 @@ def test_a_narrow_kernel_opens_as_wide_as_the_prediction_may_be_wrong(seed):
     assert pose_error(denied.T_world_lidar, TRUTH)[0] > 0.3
 
 
+def test_the_kernel_is_closed_at_the_solution():
+    """A prediction error below the kernel's own scale has no effect, though the scan has outliers."""
+    points = scan_of("room", 4).at[::4].multiply(0.97)
+    start = perturbed(0.1, 0.5, 2)
+    closed, opened = (solve(MAPS["room"], points, start, error) for error in (0.0, 0.14))
+    np.testing.assert_array_equal(opened.T_world_lidar.wxyz_xyz, closed.T_world_lidar.wxyz_xyz)
+
+
 def test_a_noise_free_scan_is_placed_to_millimetres():
     result = solve(MAPS["room"], scan_of("room", 5, noise=0.0), perturbed(0.2, 1.0, 0), 0.3)
     moved, turned = pose_error(result.T_world_lidar, TRUTH)
