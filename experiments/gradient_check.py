@@ -159,7 +159,8 @@ def ends_of(recipe: Any, free: Any, objective: Any, pairs: np.ndarray, recording
     inserted, differing, iterations = 0, 0, []
     for fed, state, output in run_steps(Compiled(batched(recipe), params), recording.scan_inputs()):
         truth = recording.truth_at(fed.end_ns)
-        sums = _added(objective, params, sums, state, output, fed.scan, truth)
+        scan = jax.tree.map(jnp.asarray, fed.scan)
+        sums = _added(objective, params, sums, state, output, scan, truth)
         added = np.asarray(output.added).reshape(len(pairs), 2, -1)
         inserted = inserted + added.sum((1, 2)) / 2
         differing = differing + (added[:, 0] != added[:, 1]).sum(1)
