@@ -44,7 +44,7 @@ class Recipe:
         velocity = state.nav.velocity + speed * params.imu.gyro_noise * 100
         nav = dataclasses.replace(state.nav, velocity=velocity)
         return State(nav, state.map + 1, speed), SimpleNamespace(
-            registration=SimpleNamespace(rmse=speed**2, status=jnp.int32(0)),
+            registration=SimpleNamespace(rmse=speed**2, blur=speed**2, status=jnp.int32(0)),
             lost=jnp.array(False),
             covariance=None,
             evidence=None,
