@@ -104,10 +104,11 @@ def test_gradients_through_the_map_agree_with_differences_of_whole_runs(recipe, 
         (first, high), (last, low) = ends if len(ends) == 2 else [*ends, (0.0, middle)]
         difference = (high - low) / (first - last)
         assert result.gradient[component] == pytest.approx(difference, rel=1e-4, abs=2e-10 / step), name
-    # the test would see a map that is held: by the lever arm its derivative is several times too large
-    still = streaming_gradient(*about)
-    arms = [component for component, name in enumerate(free.names) if "extrinsics.translation" in name]
-    assert np.all(np.abs(still.gradient[arms]) > 3 * np.abs(result.gradient[arms]))
+    if not features:
+        # the test would see a map that is held: by the lever arm its derivative is several times too large
+        still = streaming_gradient(*about)
+        arms = [component for component, name in enumerate(free.names) if "extrinsics.translation" in name]
+        assert np.all(np.abs(still.gradient[arms]) > 3 * np.abs(result.gradient[arms]))
 
 
 def test_a_gradient_goes_through_the_map_where_that_matters():
