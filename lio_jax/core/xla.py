@@ -1,4 +1,5 @@
-"""How programs are compiled by XLA and kept, and how an intermediate result is not computed twice."""
+"""How programs are compiled by XLA and kept, how an intermediate result is not computed twice, and how a
+table is changed where it lies."""
 
 import gc
 import threading
@@ -10,6 +11,7 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int32
 
 _Tree = TypeVar("_Tree")
 
@@ -29,6 +31,70 @@ def computed_once(tree: _Tree) -> _Tree:
     return jax.lax.cond(
         always, lambda leaves: leaves, lambda leaves: jax.tree.map(jnp.zeros_like, leaves), tree
     )
+
+
+_PIECE = 256
+"""Number of rows that :func:`added_in_place` adds at a time."""
+
+
+def added_in_place(
+    table: Float[Array, "c w"],
+    slots: Int32[Array, " n"],
+    change: Float[Array, "n w"],
+    total: Int32[Array, ""],
+) -> Float[Array, "c w"]:
+    """Return the table with the first ``total`` rows of ``change`` added at their slots.
+
+    The table is written where it lies, in as many pieces as there are changes, both here and in the
+    transposed function. To JAX this is the solution (table + S change, change) of a linear system, because a
+    loop whose length is not known in advance can't be transposed otherwise.
+
+    Args:
+        table: c rows.
+        slots: where to add each row of ``change``, below c.
+        change: n rows, at least one.
+        total: number of rows that count, the first ones.
+    """
+    size = min(_PIECE, len(slots))
+
+    def in_pieces(start: _Tree, piece: Callable[[Array, Array, _Tree], _Tree]) -> _Tree:
+        def body(number: Array, carry: _Tree) -> _Tree:
+            first = jnp.minimum(number * size, len(slots) - size)
+            some = first + jnp.arange(size, dtype=jnp.int32)
+            mine = (some >= number * size) & (some < total)
+            return piece(
+                first, jnp.where(mine, slots.at[some].get(mode="promise_in_bounds"), len(table)), carry
+            )
+
+        return jax.lax.fori_loop(0, (total + size - 1) // size, body, start)
+
+    def system(unknown: tuple[Array, Array]) -> tuple[Array, Array]:
+        after, change = unknown
+        held = jnp.where(jnp.arange(len(slots)) < total, slots, len(table))
+        return after.at[held].add(-change, mode="drop"), change
+
+    def solve(_: Any, right: tuple[Array, Array]) -> tuple[Array, Array]:
+        change = right[1]
+
+        def add(first: Array, held: Array, table: Array) -> Array:
+            return table.at[held].add(jax.lax.dynamic_slice_in_dim(change, first, size), mode="drop")
+
+        return in_pieces(right[0], add), change
+
+    def solve_transposed(_: Any, right: tuple[Array, Array]) -> tuple[Array, Array]:
+        after = right[0]
+
+        def add(first: Array, held: Array, change: Array) -> Array:
+            more = jax.lax.dynamic_slice_in_dim(change, first, size)
+            more += after.at[held].get(mode="fill", fill_value=0.0)
+            return jax.lax.dynamic_update_slice_in_dim(change, more, first, 0)
+
+        return after, in_pieces(right[1], add)
+
+    # JAX differentiates and transposes the solution only if neither half is constant or unused
+    table = table.at[0].add(0 * change[0])
+    after, same = jax.lax.custom_linear_solve(system, (table, change), solve, solve_transposed)
+    return after.at[0].add(0 * same[0])
 
 
 _CPU_OPTIONS: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False}

@@ -27,6 +27,18 @@ class Intervals(eqx.Module):
     measured: Bool[Array, ""]
     """False where no sample is near the span: all rates and forces are then zero."""
 
+    def without_bias(
+        self, gyro_bias: Float[Array, "3"], accel_bias: Float[Array, "3"]
+    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        """Return angular rates (rad/s) and specific forces (m/s^2) without biases; zero where not measured.
+
+        Args:
+            gyro_bias: rad/s, IMU frame.
+            accel_bias: m/s^2, IMU frame.
+        """
+        rate = jnp.where(self.measured, self.gyro - gyro_bias, 0.0)
+        return rate, jnp.where(self.measured, self.accel - accel_bias, 0.0)
+
 
 def sample_intervals(
     imu: ImuBatch, time_offset: Float[Array, ""], start: Float[Array, ""], end: Float[Array, ""]

@@ -157,12 +157,12 @@ def propagate_sweep(
     last = jaxlie.SE3(path.T_world_imu.wxyz_xyz[-1])
     moved = dataclasses.replace(nav, T_world_imu=last, velocity=path.velocity[-1])
 
-    motion = _Motion(intervals, shift, path.rate, path.accel, increments)
-    measured = _Measured(nav.gyro_bias, nav.accel_bias, nav.time_offset, params)
-    span = imu, start, end, sweep_start
-    held = jax.lax.stop_gradient((measured, span))
-    known = _effects_of(jax.lax.stop_gradient(motion), held[0].noise, *held[1][1:])
-    effects = with_derivative_of(known, _linear_effects, measured, held[0], span)
+    motion = _SampledMotion(intervals, shift, path.rate, path.accel, increments)
+    model = _ImuModel(nav.gyro_bias, nav.accel_bias, nav.time_offset, params)
+    times = start, end, sweep_start
+    held = jax.lax.stop_gradient(model)
+    known = _effects_of(*jax.lax.stop_gradient((motion, params, *times)))
+    effects = with_derivative_of(known, _linear_effects, model, held, imu, times)
 
     shown = still_to_show(start, sweep_start, end)
     transition = _transition(nav, increments, path.gravity, effects.by_bias, effects.by_offset, shown)
@@ -170,7 +170,7 @@ def propagate_sweep(
     return SweptState(moved, (covariance + covariance.T) / 2), path
 
 
-class _Motion(NamedTuple):
+class _SampledMotion(NamedTuple):
     """The motion in each interval of a span."""
 
     intervals: Intervals
@@ -183,7 +183,7 @@ class _Motion(NamedTuple):
     increments: Increments
 
 
-class _Measured(NamedTuple):
+class _ImuModel(NamedTuple):
     """What the effects of a span's samples depend on, beside the samples."""
 
     gyro_bias: Float[Array, "3"]
@@ -204,7 +204,9 @@ class _Effects(NamedTuple):
     """Derivative by the time offset."""
 
 
-def _effects_of(motion: _Motion, noise: ImuParams, start: Array, end: Array, sweep_start: Array) -> _Effects:
+def _effects_of(
+    motion: _SampledMotion, noise: ImuParams, start: Array, end: Array, sweep_start: Array
+) -> _Effects:
     intervals, shift, rate, accel, increments = motion
     effect = sensitivity(increments, intervals.duration, rate, accel)
     knots = start + increments.time
@@ -222,8 +224,8 @@ def _effects_of(motion: _Motion, noise: ImuParams, start: Array, end: Array, swe
     )
 
 
-def _linear_effects(measured: _Measured, held: _Measured, span: tuple) -> _Effects:
-    """Return the effects as a linear function of ``measured`` around the same values.
+def _linear_effects(model: _ImuModel, held: _ImuModel, imu: ImuBatch, times: tuple) -> _Effects:
+    """Return the effects as a linear function of the model around the same values.
 
     The slope by each of its few numbers is worked out once, so the cost grows little with the number of
     tangents.
@@ -232,13 +234,13 @@ def _linear_effects(measured: _Measured, held: _Measured, span: tuple) -> _Effec
 
     def effects(x: Array) -> _Effects:
         gyro_bias, accel_bias, time_offset, noise = numbers(x)
-        intervals, shift = _intervals_and_shift(span[0], time_offset, *span[1:3])
-        rate, accel = _without_bias(intervals, gyro_bias, accel_bias)
+        intervals, shift = _intervals_and_shift(imu, time_offset, *times[:2])
+        rate, accel = intervals.without_bias(gyro_bias, accel_bias)
         increments = accumulate(intervals.duration, rate, accel)
-        return _effects_of(_Motion(intervals, shift, rate, accel, increments), noise, *span[1:])
+        return _effects_of(_SampledMotion(intervals, shift, rate, accel, increments), noise, *times)
 
     slopes = jax.vmap(lambda unit: jax.jvp(effects, (at,), (unit,))[1])(jnp.eye(len(at), dtype=at.dtype))
-    moved = ravel_pytree(measured)[0] - at
+    moved = ravel_pytree(model)[0] - at
     return jax.tree.map(lambda value, slope: value + jnp.tensordot(moved, slope, 1), effects(at), slopes)
 
 
@@ -266,7 +268,7 @@ def path_along(nav: NavState, imu: ImuBatch, start: Float[Array, ""], end: Float
 
 
 def _follow(nav: NavState, intervals: Intervals, start: Float[Array, ""]) -> tuple[Increments, Path]:
-    rate, accel = _without_bias(intervals, nav.gyro_bias, nav.accel_bias)
+    rate, accel = intervals.without_bias(nav.gyro_bias, nav.accel_bias)
     # constant velocity where nothing is measured, so gravity must have no effect either
     gravity = jnp.where(intervals.measured, nav.gravity, 0.0)
     increments = accumulate(intervals.duration, rate, accel)
@@ -285,12 +287,6 @@ def _follow(nav: NavState, intervals: Intervals, start: Float[Array, ""]) -> tup
         gravity=gravity,
     )
     return increments, path
-
-
-def _without_bias(intervals: Intervals, gyro_bias: Array, accel_bias: Array) -> tuple[Array, Array]:
-    measured = intervals.measured
-    rate = jnp.where(measured, intervals.gyro - gyro_bias, 0.0)
-    return rate, jnp.where(measured, intervals.accel - accel_bias, 0.0)
 
 
 def _transition(

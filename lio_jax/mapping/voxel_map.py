@@ -6,7 +6,6 @@ a whole number of voxels, such that the vehicle is near the origin.
 """
 
 from collections.abc import Callable
-from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -19,9 +18,7 @@ from lio_jax.core.geometry import eigenvalues_and_normal3
 from lio_jax.core.hashing import voxel_hash
 from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.prefix_sum import running_count
-from lio_jax.core.xla import computed_once
-
-_Tree = TypeVar("_Tree")
+from lio_jax.core.xla import added_in_place, computed_once
 
 WAYS = 2
 """Number of slots that a voxel may lie in. They are neighbours in memory, so that both are read together."""
@@ -255,9 +252,9 @@ def _moments_after(
     slot = find_slots(vmap, voxel)
     held = jnp.maximum(slot, 0)
     order = jnp.arange(count, dtype=jnp.int32)
-    fresh = mask & (slot >= 0) & jnp.any(_take(old, held) != voxel, axis=1)
+    forgotten = _take(old, held)
+    fresh = mask & (slot >= 0) & jnp.any(forgotten != voxel, axis=1) & (forgotten[:, 0] != FREE)
     # of all points of a fresh voxel one takes away what its slot held before
-    fresh &= _take(old, (held, 0)) != FREE
     first = jnp.full(capacity, count, jnp.int32).at[jnp.where(fresh, slot, capacity)].min(order, mode="drop")
     clears = fresh & (_take(first, held) == order)
     touched = clears | added
@@ -286,59 +283,7 @@ def _moments_after(
     gains = jax.lax.map(chunk, jnp.arange(padded // size)).reshape(padded, 10)
     # few scans overwrite voxels
     losses = jax.lax.cond(jnp.any(clears), lost, lambda before: jnp.zeros((padded, 10), dtype), before)
-    return _added_at(before, slots, gains - losses, total)
-
-
-def _added_at(
-    table: Float[Array, "c w"],
-    slots: Int32[Array, " n"],
-    change: Float[Array, "n w"],
-    total: Int32[Array, ""],
-) -> Float[Array, "c w"]:
-    """Return the table with the first ``total`` rows of ``change`` added at their slots.
-
-    The table is written where it lies, in as many pieces as there are changes, both here and in the
-    transposed function. To JAX this is the solution (table + S change, change) of a linear system, because a
-    loop whose length is not known in advance can't be transposed otherwise.
-    """
-    size = min(_CHUNK // 4, len(slots))
-
-    def in_pieces(start: _Tree, piece: Callable[[Array, Array, _Tree], _Tree]) -> _Tree:
-        def body(number: Array, carry: _Tree) -> _Tree:
-            first = jnp.minimum(number * size, len(slots) - size)
-            some = first + jnp.arange(size, dtype=jnp.int32)
-            mine = (some >= number * size) & (some < total)
-            return piece(first, jnp.where(mine, _take(slots, some), len(table)), carry)
-
-        return jax.lax.fori_loop(0, (total + size - 1) // size, body, start)
-
-    def system(unknown: tuple[Array, Array]) -> tuple[Array, Array]:
-        after, change = unknown
-        held = jnp.where(jnp.arange(len(slots)) < total, slots, len(table))
-        return after.at[held].add(-change, mode="drop"), change
-
-    def solve(_: Any, right: tuple[Array, Array]) -> tuple[Array, Array]:
-        change = right[1]
-
-        def add(first: Array, held: Array, table: Array) -> Array:
-            return table.at[held].add(jax.lax.dynamic_slice_in_dim(change, first, size), mode="drop")
-
-        return in_pieces(right[0], add), change
-
-    def solve_transposed(_: Any, right: tuple[Array, Array]) -> tuple[Array, Array]:
-        after = right[0]
-
-        def add(first: Array, held: Array, change: Array) -> Array:
-            more = jax.lax.dynamic_slice_in_dim(change, first, size)
-            more += after.at[held].get(mode="fill", fill_value=0.0)
-            return jax.lax.dynamic_update_slice_in_dim(change, more, first, 0)
-
-        return after, in_pieces(right[1], add)
-
-    # JAX differentiates and transposes the solution only if neither half is constant or unused
-    table = table.at[0].add(0 * change[0])
-    after, same = jax.lax.custom_linear_solve(system, (table, change), solve, solve_transposed)
-    return after.at[0].add(0 * same[0])
+    return added_in_place(before, slots, gains - losses, total)
 
 
 def _moment_row(offset: Float[Array, "m 3"]) -> Float[Array, "m 10"]:
