@@ -3,6 +3,7 @@
 import gc
 import os
 import shutil
+import time
 from pathlib import Path
 
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=true")
@@ -54,21 +55,37 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 _MAPPINGS, _MEMORY = Path("/proc/self/maps"), Path("/proc/self/statm")
-_MOST_MAPPINGS = 40_000
+_MOST_MAPPINGS = 35_000
 """The kernel allows a process 65,530. Compiled programs take several each; where one finds none left, the
-process ends by a segmentation fault."""
+process ends by a segmentation fault. One test adds up to 16,000."""
 _MOST_MEMORY = 3 * 2**30
 """Bytes; several processes share a machine, and most of what they hold are programs not needed again."""
 
 
 @pytest.fixture(scope="module", autouse=True)
-def room_for_programs():
-    """Give the room of the last modules' programs to the next one's where it runs short."""
-    if not _MEMORY.exists():
-        return
-    mappings = _MAPPINGS.read_bytes().count(b"\n")
-    resident = int(_MEMORY.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    if mappings > _MOST_MAPPINGS or resident > _MOST_MEMORY:
-        xla.forget_programs()
-        jax.clear_caches()
-        gc.collect()
+def memory_for_programs():
+    """Give the memory of the last modules' programs to the next one's where it runs short."""
+    if _MEMORY.exists():
+        resident = int(_MEMORY.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        if resident > _MOST_MEMORY:
+            _forget_programs()
+
+
+_SECONDS_BETWEEN_COUNTS = 5.0
+"""Counting the mappings takes some 20 ms: short tests share one count."""
+_counted_at = [0.0]
+
+
+@pytest.fixture(autouse=True)
+def mappings_for_programs():
+    """Give the mappings of the last tests' programs to the next one's where they run short."""
+    if _MAPPINGS.exists() and time.monotonic() - _counted_at[0] > _SECONDS_BETWEEN_COUNTS:
+        if _MAPPINGS.read_bytes().count(b"\n") > _MOST_MAPPINGS:
+            _forget_programs()
+        _counted_at[0] = time.monotonic()
+
+
+def _forget_programs() -> None:
+    xla.forget_programs()
+    jax.clear_caches()
+    gc.collect()
