@@ -121,6 +121,7 @@ def run(
     gt: Annotated[Path | None, arg(metavar="FILE")] = None,
     overwrite: Overwrite = False,
     live: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> None:
     """Estimate trajectory and map of a recording.
 
@@ -134,12 +135,14 @@ def run(
         gt: Ground truth of T_world_imu (TUM, run folder or recording); None means the recording's own.
         overwrite: Replace the results of an earlier run in that folder.
         live: Show the run in a browser of this computer while it goes on.
+        resume: Go on with a run that was killed or interrupted; start it where there is none, and do nothing
+            where it is finished.
     """
     from lio_jax.commands.run import run as command
     from lio_jax.commands.runtime import prepare_jax
 
     prepare_jax()
-    command(data, recipe, set_, params_from, out, start, scans, gt, overwrite, live)
+    command(data, recipe, set_, params_from, out, start, scans, gt, overwrite, live, resume)
 
 
 @app.command(name="eval")

@@ -15,9 +15,11 @@ from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory, write_tum
 from lio_jax.recipes import recipe_named
 from lio_jax.run.folder import run_folder, write_json
+from lio_jax.run.journal import opened_journal
 from lio_jax.run.run import check_start, run_sequence, settings_for
 from lio_jax.run.sinks import RunResult, Sink
 from lio_jax.run.track import ScanResult
+from lio_jax.run.unfinished import CONFIG, finished_scans, read_unfinished
 from lio_jax.run.verdict import in_words
 from lio_jax.settings.settings import Settings, load_settings, recipe_settings, with_overrides
 from lio_jax.settings.translate import ForeignKey, ForeignSettings, load_foreign_settings
@@ -36,16 +38,27 @@ def run(
     gt: Path | None,
     overwrite: bool,
     live: bool = False,
+    resume: bool = False,
 ) -> None:
     """Run one recording from the command line."""
     if start < 0 or (scans is not None and scans < 1):
         raise UsageError(f"--start must be 0 or more and --scans 1 or more, not {start} and {scans}.")
-    settings = resolve_settings(recipe, assignments, params_from)
+    if resume and overwrite:
+        raise UsageError("--resume goes on with the run in the folder and --overwrite replaces it; give one.")
+    if resume and (done := finished_scans(out)) is not None:
+        say(f"{out}: the run of {done} scans is finished; there is nothing left to do.")
+        return
+    begun = read_unfinished(out) if resume else None
+    if begun is not None and (recipe, assignments, params_from, start, scans) == (None, (), None, 0, None):
+        say(f"note: the settings are those of the unfinished run in {out}.")
+        settings, start, scans = load_settings(out / CONFIG), begun.start, begun.count
+    else:
+        settings = resolve_settings(recipe, assignments, params_from)
     sequence = open_sequence(data, settings.run.data)
     truth = truth_of(sequence, gt)
     if live and not settings.run.output.recording:
         raise UsageError("--live shows the recording, and config.output.recording=false leaves it out.")
-    run_and_report(sequence, settings, out, start, scans, truth, overwrite, live)
+    run_and_report(sequence, settings, out, start, scans, truth, overwrite, live, resume)
 
 
 def run_and_report(
@@ -57,6 +70,7 @@ def run_and_report(
     truth: Trajectory | None,
     overwrite: bool,
     live: bool = False,
+    resume: bool = False,
 ) -> RunResult:
     """Run a recording into a folder, evaluate against truth, draw, and print a summary.
 
@@ -65,7 +79,7 @@ def run_and_report(
         LioJaxError: nothing could be read, or the run ended early; what was computed is written.
     """
     check_start(sequence, start)
-    with run_folder(out, overwrite):
+    with run_folder(out, overwrite, resume):
         return run_into(sequence, settings, out, start, count, truth, live)
 
 
@@ -188,7 +202,8 @@ def run_into(
             recording = stack.enter_context(ViewerRecording(out / "recording.rrd", total, address))
             sinks.append(RecordingSink(recording, out, truth))
         sinks.append(_ProgressBar(total))
-        result = run_sequence(sequence, settings, out, start, count, sinks, notify=say)
+        journal = stack.enter_context(opened_journal(out, sequence, settings, start, count, say))
+        result = run_sequence(sequence, settings, out, start, count, sinks, say, journal)
         if isinstance(result.interruption, KeyboardInterrupt):
             say("interrupted: finishing the files of what was computed ...")
     result.metrics["notes"] = [*sequence.info.notes, *notes]
@@ -200,6 +215,7 @@ def run_into(
     if evaluation_text:
         print(evaluation_text)
     _raise_if_interrupted(result, out)
+    journal.remove()
     return result
 
 
@@ -324,7 +340,7 @@ def _raise_if_interrupted(result: RunResult, out: Path) -> None:
     if error in result.unfinished:
         raise error
     if isinstance(error, KeyboardInterrupt):
-        raise LioJaxError(f"interrupted; {done}.") from error
+        raise LioJaxError(f"interrupted; {done}; add --resume to go on.") from error
     if isinstance(error, LioJaxError):
         raise LioJaxError(f"{error} The run ended early; {done}.") from error
     raise error

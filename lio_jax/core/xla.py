@@ -138,6 +138,22 @@ class PerShape:
 
     def __call__(self, *arguments: Any) -> Any:
         """Run the program for these arguments."""
+        return self._program(arguments)(*arguments)
+
+    def result(self, *arguments: Any) -> Any:
+        """Return the structure of the result, shape and dtype in the place of each array.
+
+        Args:
+            arguments: as for a call, or such structures.
+        """
+
+        def described(leaf: Any) -> jax.ShapeDtypeStruct:
+            return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, weak_type=leaf.weak_type)
+
+        # without the devices, for which the program would be compiled anew
+        return jax.tree.map(described, self._program(arguments).out_info)
+
+    def _program(self, arguments: tuple[Any, ...]) -> Any:
         leaves, structure = jax.tree.flatten(arguments)
         key = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
         program = self._programs.get(key)
@@ -145,7 +161,7 @@ class PerShape:
             start = time.perf_counter()
             program = self._programs[key] = compiled(self._jitted, *arguments)
             self.compile_s += time.perf_counter() - start
-        return program(*arguments)
+        return program
 
     def forget(self) -> None:
         """Drop the programs; they are compiled anew when they are needed."""

@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
@@ -14,7 +15,8 @@ import jax
 from lio_jax.core.errors import UsageError
 from lio_jax.core.files import atomic_path, folder_lock, remove_leftovers
 from lio_jax.run.keyframes import remove_keyframes
-from lio_jax.run.map_file import SPOOL_SUFFIX
+from lio_jax.run.map_file import SPOOL_SUFFIX, TILES_PREFIX
+from lio_jax.run.unfinished import CONFIG, MARK, TRAJECTORY, read_unfinished, remove_journal, remove_mark
 
 _LIBRARIES = ("lio-jax", "jax", "jaxlib", "numpy", "scipy")
 
@@ -80,14 +82,19 @@ _SPOOL = f"map{SPOOL_SUFFIX}"
 
 
 @contextmanager
-def run_folder(path: Path, overwrite: bool) -> Iterator[None]:
+def run_folder(path: Path, overwrite: bool, resume: bool = False) -> Iterator[None]:
     """Hold an empty run folder during the block; a folder made for it that stays empty is removed again.
 
     With ``overwrite`` the files of an earlier run are removed, and nothing else. The hidden files of a killed
-    run are removed in every case.
+    run are removed in every case, except for its journal.
+
+    Args:
+        path: of the folder.
+        overwrite: whether an earlier run may be replaced.
+        resume: whether the folder may hold an unfinished run; what that needs to go on stays.
 
     Raises:
-        UsageError: the folder is not empty and ``overwrite`` is not set, another run is writing there, or
+        UsageError: the folder is not empty and neither option allows that, another run is writing there, or
             the folder cannot be made.
     """
     if path.is_file():
@@ -101,7 +108,7 @@ def run_folder(path: Path, overwrite: bool) -> Iterator[None]:
         with folder_lock(path) as free:
             if not free:
                 raise UsageError(f"{path}: another run is writing there; choose another folder.")
-            _make_empty(path, overwrite)
+            _make_empty(path, overwrite, resume)
             yield
     finally:
         if made:
@@ -109,14 +116,26 @@ def run_folder(path: Path, overwrite: bool) -> Iterator[None]:
                 path.rmdir()
 
 
-def _make_empty(path: Path, overwrite: bool) -> None:
-    for name in (*RUN_FILES, _SPOOL):
+def _make_empty(path: Path, overwrite: bool, resume: bool) -> None:
+    for name in (*RUN_FILES, _SPOOL, MARK):
         remove_leftovers(path / name)
+    for tiles in path.glob(f"{TILES_PREFIX}*"):
+        shutil.rmtree(tiles, ignore_errors=True)
     remove_keyframes(path, unfinished_only=True)
-    if any(path.iterdir()) and not overwrite:
-        raise UsageError(f"{path}: exists and is not empty; choose another folder or add --overwrite.")
+    begun = None if overwrite else read_unfinished(path)
+    if begun is not None and not resume:
+        raise UsageError(
+            f"{path}: holds an unfinished run of {begun.scans} scans; add --resume to go on or --overwrite "
+            "to start anew."
+        )
+    if begun is None:
+        remove_journal(path)
+        if any(path.iterdir()) and not overwrite:
+            raise UsageError(f"{path}: exists and is not empty; choose another folder or add --overwrite.")
+        remove_mark(path)
     for name in RUN_FILES:
-        (path / name).unlink(missing_ok=True)
+        if begun is None or name not in (CONFIG, TRAJECTORY):
+            (path / name).unlink(missing_ok=True)
     remove_keyframes(path)
 
 

@@ -25,7 +25,7 @@ from lio_jax.pose_graph.g2o import write_graph
 from lio_jax.pose_graph.graph import LOOP, ODOMETRY, PoseGraph
 from lio_jax.run.folder import write_json
 from lio_jax.run.keyframes import KeyframePicker, KeyframeWriter, corner_marks, read_keyframes
-from lio_jax.run.map_file import MapTiles, read_cloud
+from lio_jax.run.map_file import TILES_PREFIX, MapTiles, read_cloud
 from lio_jax.run.sinks import RunResult, Sink
 from lio_jax.run.state_files import StateFiles
 from lio_jax.run.track import ScanResult
@@ -173,7 +173,7 @@ class GlobalCorrection(Sink):
     def _written_map(self) -> NDArray[np.float32]:
         """Put the keyframes' clouds where the keyframes were found to be."""
         spacing = self._settings.values["map"]["point_spacing"]
-        with tempfile.TemporaryDirectory(prefix=".tiles.", dir=self._out) as folder:
+        with tempfile.TemporaryDirectory(prefix=TILES_PREFIX, dir=self._out) as folder:
             tiles = MapTiles(Path(folder) / "tiles", spacing)
             for T_world_imu, points in read_keyframes(self._out).clouds():
                 tiles.add(T_world_imu, points)

@@ -185,6 +185,8 @@ class MapTiles:
 
 
 SPOOL_SUFFIX = ".spool"
+TILES_PREFIX = ".tiles."
+"""Begins the name of the hidden folder within a run folder that holds the tiles of a map being written."""
 _POINT_BYTES = 3 * np.dtype(np.float32).itemsize
 
 

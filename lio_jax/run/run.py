@@ -23,6 +23,7 @@ from lio_jax.run.fitted_settings import (
 )
 from lio_jax.run.folder import environment, write_json
 from lio_jax.run.global_correction import GlobalCorrection
+from lio_jax.run.journal import Journal
 from lio_jax.run.logs import Failures, Overflow, ScanLog, StageTimes, TrajectoryLog
 from lio_jax.run.map_file import MapFile
 from lio_jax.run.scan_inputs import OFFSET_MARGIN_S, ImuFeed
@@ -69,10 +70,15 @@ def run_sequence(
     count: int | None = None,
     sinks: Listing[Sink] = (),
     notify: Callable[[str], None] | None = None,
+    journal: Journal | None = None,
 ) -> RunResult:
     """Estimate the recording's trajectory and map, and write the run folder's files.
 
     An error or Ctrl-C in the middle ends the run; what was computed until then is written all the same.
+    With a journal, a run whose process was killed goes on from its last checkpoint:
+
+        with opened_journal(out, sequence, settings) as journal:
+            run_sequence(sequence, settings, out, journal=journal)
 
     Args:
         sequence: the recording.
@@ -84,6 +90,9 @@ def run_sequence(
             own sinks, and finishes after them, when their files are written. What it raises in ``take`` ends
             the run early; what it raises in ``finish`` costs its own results alone.
         notify: takes each sentence on a fault of the set-up as soon as it is known.
+        journal: of this run (:func:`lio_jax.run.journal.opened_journal`). All sinks take every scan of a
+            resumed run, once, as those of a run that was never killed. ``result.output`` of a scan before the
+            checkpoint has numpy leaves. None: the run cannot be resumed.
 
     Raises:
         UsageError: the recording ends before ``start``.
@@ -110,13 +119,16 @@ def run_sequence(
         interruption: BaseException | None = None
         try:
             # closing: a sink that raises must not leave the decoding thread and its files behind
-            with closing(scans), closing(track(settings, scans, imu, step)) as results:
+            with closing(scans), closing(track(settings, scans, imu, step, journal)) as results:
                 _hand_out(results, everyone, times.ms["record"])
         except (KeyboardInterrupt, Exception) as error:
             interruption = error
         if not len(log):
             raise interruption or nothing_read(sequence)
         metrics = {"recording": _described(sequence), **prediction(sequence, imu, imu_notes)}
+        if journal is not None:
+            metrics["warnings"] += journal.warnings()
+            metrics |= {"resumed_at_scan": start + journal.scans} if journal.scans else {}
         run = RunResult(metrics=metrics, interruption=interruption)
         finish_all(everyone, run)
     run.metrics |= {

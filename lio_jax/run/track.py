@@ -18,6 +18,7 @@ from lio_jax.data.sequence import LidarScan, prefetched
 from lio_jax.recipes.params import RecipeParams as Params
 from lio_jax.recipes.transforms import RecipeLike, Stepper, reopened, with_first_velocity
 from lio_jax.run.failures import BridgedOutage, OutageWatch, ScanEvidence, failure_of, longest_gap
+from lio_jax.run.journal import Journal
 from lio_jax.run.scan_inputs import ImuFeed, bucket_for, padded
 from lio_jax.run.shown_motion import MotionCheck, ShownMotion, first_velocity
 from lio_jax.settings.settings import Settings, recipe_of
@@ -95,6 +96,17 @@ class Compiled:
         """Return state and output after a scan; ``state`` is consumed."""
         return self.step_programs(self.params, state, scan, imu)
 
+    def structures(self, before: ImuBatch | None, scan: Scan, imu: ImuBatch | None) -> tuple[Any, Any]:
+        """Return state and output after a first scan, the shape and dtype in the place of each array.
+
+        Args:
+            before: inertial samples up to the scan's end, or None.
+            scan: padded.
+            imu: samples that cover it, or None.
+        """
+        state = self.init_programs.result(self.params, before)
+        return self.step_programs.result(self.params, state, scan, imu)
+
     def _compiled_s(self) -> float:
         return self.init_programs.compile_s + self.step_programs.compile_s
 
@@ -114,6 +126,7 @@ def track(
     scans: Iterable[LidarScan],
     imu: ImuFeed | None = None,
     step: CompiledStep | None = None,
+    journal: Journal | None = None,
 ) -> Generator[ScanResult]:
     """Yield the result of each scan in turn, each while the step of the next scan runs.
 
@@ -125,15 +138,18 @@ def track(
         scans: in time order.
         imu: inertial samples; None where there are none or the recipe is to do without.
         step: of the same settings; None: a new one. It tells how long compiling took.
+        journal: gives back the steps of a killed run, which are not computed again, and stores the others.
     """
     step = step or CompiledStep(settings)
     judged = ResultBuilder(settings)
-    compiled_s = step.compile_s
     held: tuple[Any, ...] | None = None
     # closing: whoever stops early must not leave the decoding thread and its files behind
     with ThreadPoolExecutor(1) as reader, closing(scan_inputs(settings, scans, imu)) as inputs:
+        for fed, nav, output, step_ms in journal.replayed(step, inputs) if journal else ():
+            yield judged(fed, nav, output.registration, output, step_ms)
+        compiled_s = step.compile_s
         try:
-            for fed, state, output in run_steps(step, inputs):
+            for fed, state, output in run_steps(step, inputs, journal.state if journal else None):
                 reading = reader.submit(_on_host, state.nav, output.registration)
                 compiled_in_step_s, compiled_s = step.compile_s - compiled_s, step.compile_s
                 if held is not None:
@@ -142,6 +158,8 @@ def track(
                 nav, registration, read_at = reading.result()
                 step_ms = (read_at - fed.begun_at - compiled_in_step_s) * 1e3
                 held = fed, nav, registration, output, step_ms
+                if journal is not None:
+                    journal.add(fed, nav, output, step_ms, state if fed.usable else None)
         except (KeyboardInterrupt, Exception):
             if held is not None:
                 yield judged(*held)
@@ -298,15 +316,22 @@ def sees_enough(scan: Scan, settings: Settings) -> bool:
     return int(np.count_nonzero(in_range)) >= needed
 
 
-def run_steps(stepper: Stepper, scan_inputs: Iterable[ScanInput]) -> Iterator[tuple[ScanInput, Any, Any]]:
+def run_steps(
+    stepper: Stepper, scan_inputs: Iterable[ScanInput], state: Any = None
+) -> Iterator[tuple[ScanInput, Any, Any]]:
     """Yield each scan with the state and the output after it; the state is consumed by the next one.
 
     The first usable scan is yielded when the second one is there: only that shows how fast the vehicle
     was.
+
+    Args:
+        stepper: of the run.
+        scan_inputs: in time order.
+        state: after a usable scan before these, from which to go on; it is consumed. None: these are the
+            first ones.
     """
-    state: Any = None
     held: tuple[ScanInput, Any, Any] | None = None
-    opened = False
+    opened = state is not None
     try:
         for fed in scan_inputs:
             if held is not None:
