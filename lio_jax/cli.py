@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional, arg
 
-from lio_jax.commands.runtime import usage_in_a_sentence
+from lio_jax.commands.runtime import ended_like_ctrl_c, usage_in_a_sentence
 from lio_jax.commands.sim_options import ErrorOptions, Format, MotionOptions, SensorOptions
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.tuning.objective_names import EXAMPLE, LISTED
@@ -381,7 +381,7 @@ def main(argv: list[str] | None = None) -> int:
             print(f"lio-jax {version('lio-jax')}")
             return 0
         words = _gathered([word for word in words if word != "--debug"])
-        with usage_in_a_sentence(words, app):
+        with usage_in_a_sentence(words, app), ended_like_ctrl_c():
             app.cli(args=words, prog="lio-jax", description=_DESCRIPTION)
         sys.stdout.flush()
     except SystemExit as leaving:

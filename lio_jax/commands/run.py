@@ -1,6 +1,6 @@
 """``lio-jax run``: resolve the settings, run a recording into a folder, and print the results."""
 
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -70,17 +70,29 @@ def run_and_report(
     truth: Trajectory | None,
     overwrite: bool,
     live: bool = False,
-    resume: bool = False,
+    resume: bool | None = None,
 ) -> RunResult:
     """Run a recording into a folder, evaluate against truth, draw, and print a summary.
+
+    Args:
+        sequence: the recording.
+        settings: of the run.
+        out: the run folder.
+        start: first scan.
+        count: number of scans; None: to the end.
+        truth: T_truth_imu, where it is known.
+        overwrite: whether an earlier run in the folder may be replaced.
+        live: whether a browser of this computer shows the run.
+        resume: whether an unfinished run in the folder goes on; None: and this run leaves nothing from which
+            it could go on later.
 
     Raises:
         UsageError: the recording ends before ``start``, or the folder may not be written.
         LioJaxError: nothing could be read, or the run ended early; what was computed is written.
     """
     check_start(sequence, start)
-    with run_folder(out, overwrite, resume):
-        return run_into(sequence, settings, out, start, count, truth, live)
+    with run_folder(out, overwrite, bool(resume)):
+        return run_into(sequence, settings, out, start, count, truth, live, resume is not None)
 
 
 def beneath_recipe(foreign: ForeignSettings, recipe: str | None, is_file: bool) -> Settings:
@@ -187,8 +199,9 @@ def run_into(
     count: int | None,
     truth: Trajectory | None,
     live: bool = False,
+    resumable: bool = False,
 ) -> RunResult:
-    """Run a recording into an empty folder; see :func:`run_and_report`."""
+    """Run a recording into a folder, empty or of an unfinished run; see :func:`run_and_report`."""
     settings, notes = settings_for(sequence, settings)
     info = sequence.info
     for note in (*info.notes, *notes):
@@ -202,7 +215,8 @@ def run_into(
             recording = stack.enter_context(ViewerRecording(out / "recording.rrd", total, address))
             sinks.append(RecordingSink(recording, out, truth))
         sinks.append(_ProgressBar(total))
-        journal = stack.enter_context(opened_journal(out, sequence, settings, start, count, say))
+        opened = opened_journal(out, sequence, settings, start, count, say) if resumable else nullcontext()
+        journal = stack.enter_context(opened)
         result = run_sequence(sequence, settings, out, start, count, sinks, say, journal)
         if isinstance(result.interruption, KeyboardInterrupt):
             say("interrupted: finishing the files of what was computed ...")
@@ -214,8 +228,9 @@ def run_into(
     print(_summary(result, out), end="\n\n" if evaluation_text else "\n")
     if evaluation_text:
         print(evaluation_text)
-    _raise_if_interrupted(result, out)
-    journal.remove()
+    _raise_if_interrupted(result, out, resumable)
+    if journal is not None:
+        journal.remove()
     return result
 
 
@@ -332,7 +347,7 @@ def _corrected(backend: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _raise_if_interrupted(result: RunResult, out: Path) -> None:
+def _raise_if_interrupted(result: RunResult, out: Path, resumable: bool) -> None:
     error = result.interruption
     if error is None:
         return
@@ -340,7 +355,8 @@ def _raise_if_interrupted(result: RunResult, out: Path) -> None:
     if error in result.unfinished:
         raise error
     if isinstance(error, KeyboardInterrupt):
-        raise LioJaxError(f"interrupted; {done}; add --resume to go on.") from error
+        further = "; add --resume to go on" if resumable else ""
+        raise LioJaxError(f"interrupted; {done}{further}.") from error
     if isinstance(error, LioJaxError):
         raise LioJaxError(f"{error} The run ended early; {done}.") from error
     raise error

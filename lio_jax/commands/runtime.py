@@ -4,7 +4,9 @@ import dataclasses
 import difflib
 import inspect
 import os
+import signal
 import sys
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,6 +37,30 @@ def prepare_jax() -> None:
     jax.config.update("jax_compilation_cache_dir", str(cache))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+@contextmanager
+def ended_like_ctrl_c() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the block as Ctrl-C does: what was computed is written.
+
+    A signal that is ignored, as under nohup, stays ignored.
+    """
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before: dict[signal.Signals, Any] = {}
+    # only the main thread may set handlers
+    if threading.current_thread() is threading.main_thread():
+        chosen = (signal.SIGTERM, signal.SIGHUP)
+        before = {one: signal.getsignal(one) for one in chosen if signal.getsignal(one) == signal.SIG_DFL}
+    try:
+        for one in before:
+            signal.signal(one, interrupt)
+        yield
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
 
 
 def say(line: str) -> None:

@@ -42,7 +42,7 @@ class Unfinished:
     """Number of scans that a resumed run keeps: those before the last checkpoint."""
     since: str = field(default_factory=_now)
     """Date and time at which the run began, ISO 8601."""
-    resume: str = "add --resume to the command of this run to go on"
+    resume: str = "repeat the command of this run with --resume to go on"
     """What to type."""
 
     def write(self, folder: Path) -> None:

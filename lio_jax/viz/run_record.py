@@ -16,6 +16,7 @@ from lio_jax.evaluation.association import MatchedTrajectories, match_by_time
 from lio_jax.evaluation.trajectory_error import Alignment, align
 from lio_jax.run.keyframes import read_keyframes
 from lio_jax.run.map_file import read_cloud
+from lio_jax.run.unfinished import read_unfinished
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,9 +143,14 @@ def read_run(folder: Path) -> RunRecord:
     """Read a run folder.
 
     Raises:
-        LioJaxError: the folder is not a run's, or a file of it is damaged.
+        LioJaxError: the folder is not a run's, the run was killed, or a file of it is damaged.
     """
     missing = [name for name in _NEEDED if not (folder / name).is_file()]
+    if missing and (begun := read_unfinished(folder)):
+        raise LioJaxError(
+            f"{folder}: its run is unfinished, so there is no report yet; {begun.resume} (trajectory.tum "
+            "holds the poses so far)."
+        )
     if missing:
         raise LioJaxError(f"{folder}: {missing[0]} is not there; give a folder that lio-jax run wrote.")
     reading = folder / "metrics.json"

@@ -14,6 +14,7 @@ from pypcd4 import PointCloud
 from lio_jax.commands import run as command
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data.trajectory import read_tum
+from lio_jax.run.unfinished import MARK
 from tests.commands.test_run_folder import FILES
 from tests.run.small_drive import COUNT, PERIOD_NS, Replay, moving, shifted, standing, write_folder
 
@@ -36,7 +37,7 @@ class Breaking(Replay):
 def _check_complete(out, scans):
     from rerun.chunk import RrdReader
 
-    assert {entry.name for entry in out.iterdir()} == FILES
+    assert {entry.name for entry in out.iterdir()} == FILES | {MARK}
     assert len(read_tum(out / "trajectory.tum")) == scans
     assert len(np.load(out / "states.npz")["poses"]) == scans
     assert PointCloud.from_path(out / "map.pcd").points > 1000
@@ -54,7 +55,7 @@ def test_interrupted_while_reading(cli, tmp_path, monkeypatch, scans):
     done = cli("run", tmp_path, "--out", tmp_path / "out")
     assert done.status == 1
     assert done.err.splitlines()[-1] == (
-        f"lio-jax: interrupted; the first {scans} scans are in {tmp_path / 'out'}."
+        f"lio-jax: interrupted; the first {scans} scans are in {tmp_path / 'out'}; add --resume to go on."
     )
     _check_complete(tmp_path / "out", scans)
 
@@ -71,7 +72,7 @@ def test_interrupted_between_a_scan_and_its_record(cli, tmp_path, monkeypatch):
     done = cli("run", tmp_path, "--out", tmp_path / "out")
     assert done.status == 1
     assert "interrupted; the first 4 scans are in" in done.err
-    assert {entry.name for entry in (tmp_path / "out").iterdir()} == FILES
+    assert {entry.name for entry in (tmp_path / "out").iterdir()} == FILES | {MARK}
 
 
 def test_interrupted_before_the_first_scan(cli, tmp_path, monkeypatch):
@@ -106,8 +107,9 @@ def test_bug_in_the_middle(cli, tmp_path, monkeypatch):
     _check_complete(tmp_path / "out", 5)
 
 
-def test_ctrl_c_on_a_real_process(tmp_path):
-    """Interrupt once the map's spool has begun to grow."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_a_real_process(tmp_path, number):
+    """Send it once the map's spool has begun to grow."""
     many = islice(cycle(standing()), SCANS)
     data = write_folder(
         tmp_path / "data",
@@ -129,7 +131,7 @@ def test_ctrl_c_on_a_real_process(tmp_path):
             if spool and spool[0].stat().st_size > 0:
                 break
             time.sleep(0.01)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         _, err = process.communicate(timeout=60)
     finally:
         process.kill()
@@ -137,5 +139,7 @@ def test_ctrl_c_on_a_real_process(tmp_path):
     assert "Traceback" not in err
     scans = len(read_tum(out / "trajectory.tum"))
     assert 0 < scans < SCANS
-    assert err.splitlines()[-1] == f"lio-jax: interrupted; the first {scans} scans are in {out}."
+    assert err.splitlines()[-1] == (
+        f"lio-jax: interrupted; the first {scans} scans are in {out}; add --resume to go on."
+    )
     _check_complete(out, scans)

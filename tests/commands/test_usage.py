@@ -21,11 +21,11 @@ WRONG = {
     "run a --out b --debgu": "run: unknown option '--debgu'; did you mean --debug?",
     "run a --out b --voxel=1": (
         "run: unknown option '--voxel=1'; the options are "
-        "--out, --recipe, --set, --params-from, --start, --scans, --gt, --overwrite, --live."
+        "--out, --recipe, --set, --params-from, --start, --scans, --gt, --overwrite, --live, --resume."
     ),
     "run -x": (
         "run: unknown option '-x'; the options are "
-        "--out, --recipe, --set, --params-from, --start, --scans, --gt, --overwrite, --live."
+        "--out, --recipe, --set, --params-from, --start, --scans, --gt, --overwrite, --live, --resume."
     ),
     "inspect a --jsn": "inspect: unknown option '--jsn'; did you mean --json?",
     "run": "run: needs DATA and --out DIR; --help explains the command.",
