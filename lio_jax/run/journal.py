@@ -159,6 +159,7 @@ class Journal:
         self.count = 0
         """Number of scans so far."""
         self._last_s = time.monotonic()
+        self._pending = False
         self._waiting: queue.Queue[Callable[[], None] | None] = queue.Queue(_WAITING)
         # a daemon: a disk that hangs must not keep the process from its end
         self._thread = threading.Thread(target=self._work, name="journal", daemon=True)
@@ -217,7 +218,10 @@ class Journal:
         values = {"end_ns": int(fed.end_ns), "pad_ms": float(fed.pad_ms), "step_ms": float(step_ms)}
         self.count += 1
         self._waiting.put(lambda: self._write_step(values, nav, output))
-        if state is not None and time.monotonic() - self._last_s >= CHECKPOINT_EVERY_S:
+        due = time.monotonic() - self._last_s >= CHECKPOINT_EVERY_S
+        # one at a time: on a slow disk their copies would fill the memory
+        if state is not None and due and not self._pending:
+            self._pending = True
             scans, leaves = self.count, [np.array(leaf) for leaf in jax.tree.leaves(state)]
             self._waiting.put(lambda: self._write_checkpoint(scans, leaves))
             self._last_s = time.monotonic()
@@ -330,6 +334,7 @@ class Journal:
             os.close(folder)
         self._mark = replace(self._mark, scans=scans)
         self._mark.write(self._folder)
+        self._pending = False
 
 
 @contextmanager
