@@ -39,6 +39,7 @@ _TIMES = {"scan_ms", "compile_s", "wall_s", "peak_rss_mb", "resumed_at_scan"}
 def often(monkeypatch):
     """Let every scan have a checkpoint."""
     monkeypatch.setattr(journal_module, "CHECKPOINT_EVERY_S", 0.0)
+    monkeypatch.setattr(journal_module, "POSES_AT_ONCE", 1)
 
 
 def contents(folder):
