@@ -150,6 +150,9 @@ class Journal:
         self.scans = 0 if self._checkpoint is None else int(self._checkpoint.values["scans"])
         """Number of scans whose steps are stored."""
         self._size = 0 if self._checkpoint is None else int(self._checkpoint.values["bytes"])
+        if self._mark.scans != self.scans:
+            self._mark = replace(self._mark, scans=self.scans)
+            self._mark.write(folder)
         if self._checkpoint is None:
             remove_journal(folder)
         (folder / JOURNAL).mkdir(exist_ok=True)
