@@ -11,7 +11,7 @@ from lio_jax.core.leaf import leaf, section, static
 from lio_jax.core.types import Scalar
 from lio_jax.lidar.params import BeamParams
 from lio_jax.mapping.params import VoxelMapParams
-from lio_jax.registration.params import GaussNewtonMatch, RobustMatch, WeighedMatch
+from lio_jax.registration.params import GaussNewtonMatch, RobustMatch
 
 
 class BackendParams(eqx.Module):
@@ -129,8 +129,8 @@ class LoopsConfig:
     """Sectors of a place's descriptor over the full turn."""
 
 
-class AlignmentMatch(GaussNewtonMatch, RobustMatch, WeighedMatch):
-    """The match of two local clouds by Gauss-Newton, whose information enters the pose graph."""
+class AlignmentMatch(GaussNewtonMatch, RobustMatch):
+    """The match of two local clouds by Gauss-Newton."""
 
 
 class AlignmentParams(eqx.Module):

@@ -130,8 +130,8 @@ _Array = NDArray[np.float64]
 
 _SPACING = 0.4
 """Edge of the cubes to which the aligned points are thinned, m."""
-_SCALE: float = numbers_of(AlignmentParams)["registration"]["information_scale"]
-"""Share of the information that is believed where the recipe declares none."""
+_BELIEVED = 0.03
+"""Share of an alignment's information that is believed, because neighbouring points share the map's error."""
 _OTHER_FIT = (2.0, 0.15)
 """Distances, m and rad, above which two fits are different."""
 
@@ -173,7 +173,6 @@ def verify(
         settings: ``config.loops`` and ``params.loop``.
     """
     limits, sizes = settings.values["loop"], settings.run.loops
-    scale = settings.values["registration"].get("information_scale", _SCALE)
     source, target = proposal.source, proposal.target
     if proposal.twin is not None:
         return refused(proposal, f"keyframe {proposal.twin}, where it cannot be, looks as much alike")
@@ -217,7 +216,7 @@ def verify(
     def conflicting(T: _Array) -> float:
         return conflict(seen, theirs[their_upright], T)
 
-    return _judged(proposal, candidates, conflicting, poses[[target, source]], limits, scale)
+    return _judged(proposal, candidates, conflicting, poses[[target, source]], limits)
 
 
 def _judged(
@@ -226,7 +225,6 @@ def _judged(
     conflicting: Callable[[_Array], float],
     poses: _Array,
     limits: Mapping[str, Any],
-    scale: float,
 ) -> Verdict:
     error = possible_error(proposal.metres, limits)
     if not candidates:
@@ -269,7 +267,7 @@ def _judged(
     to_body = np.kron(np.eye(2), poses[1, :3, :3])
     information = np.zeros((6, 6))
     if not reason:
-        information = _believed(to_body.T @ best.information @ to_body, limits, scale)
+        information = _believed(to_body.T @ best.information @ to_body, limits)
     left, right = np.eye(4), np.eye(4)
     left[:3, :3], right[:3, :3] = poses[0, :3, :3].T, poses[1, :3, :3]
     return Verdict(
@@ -295,10 +293,10 @@ def refused(proposal: Proposal, reason: str) -> Verdict:
     return Verdict(proposal, False, reason, proposal.T_target_source, np.zeros((6, 6)))
 
 
-def _believed(information: _Array, limits: Mapping[str, Any], scale: float) -> _Array:
-    """Return the information reduced for correlated errors: neighbouring points share the map's error."""
+def _believed(information: _Array, limits: Mapping[str, Any]) -> _Array:
+    """Return the information reduced for correlated errors."""
     sigmas = np.repeat([limits["rotation_sigma"], limits["translation_sigma"]], 3)
-    believed = np.linalg.inv(np.linalg.inv(scale * information) + np.diag(sigmas**2))
+    believed = np.linalg.inv(np.linalg.inv(_BELIEVED * information) + np.diag(sigmas**2))
     return (believed + believed.T) / 2
 
 
