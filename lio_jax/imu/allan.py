@@ -1,4 +1,4 @@
-"""Allan deviation of an inertial sensor at rest, and the noise densities that fit it."""
+"""Noise densities of an inertial sensor: by its Allan deviation at rest, or by its differences in motion."""
 
 from dataclasses import dataclass
 
@@ -40,6 +40,48 @@ class NoiseFit:
         return np.sqrt(
             3 * self.quantisation**2 / tau**2 + self.white**2 / tau + self.flicker**2 + walk**2 * tau / 3
         )
+
+
+_DIFFERENCED_HZ = 50.0
+"""Rate of the averages whose differences show the noise, Hz: higher rates may be filtered in the sensor."""
+_SLOWEST_HZ = 80.0
+"""Least rate of samples whose differences show noise rather than motion, Hz."""
+_WINDOW_S = 1.0
+_FEWEST_WINDOWS = 3
+_GAP_FACTOR = 1.5
+_DIFFERENCED = 20.0
+"""Variance of the third difference of white noise of variance 1."""
+
+
+def noise_in_motion(seconds: NDArray[np.float64], samples: NDArray[np.float64]) -> float | None:
+    """Return the density of the white noise of a sensor in motion, mean of its axes.
+
+    Third differences of averages over 0.02 s contain little of a vehicle's motion. Their mean square over
+    windows of a second is that of the noise, and of vibration; the median window counts.
+
+    Args:
+        seconds: (m,) ascending, s.
+        samples: (m, axes).
+
+    Returns:
+        Unit of the samples per sqrt(Hz); None where the rate is below 80 Hz, or where less than three
+        seconds are without a gap.
+    """
+    steps = np.diff(seconds)
+    interval = float(np.median(steps)) if len(steps) else np.inf
+    if not 0 < interval < 1 / _SLOWEST_HZ:
+        return None
+    averaged = max(1, round(1 / (interval * _DIFFERENCED_HZ)))
+    rate = 1 / (interval * averaged)
+    window = averaged * round(_WINDOW_S * rate)
+    squares = []
+    for first in range(0, len(samples) - window + 1, window):
+        if np.all(steps[first : first + window - 1] < _GAP_FACTOR * interval):
+            part = samples[first : first + window].reshape(-1, averaged, samples.shape[1]).mean(1)
+            squares.append(np.mean(np.diff(part, 3, axis=0) ** 2))
+    if len(squares) < _FEWEST_WINDOWS:
+        return None
+    return float(np.sqrt(np.median(squares) / _DIFFERENCED / rate))
 
 
 def averaging_factors(count: int) -> NDArray[np.int64]:

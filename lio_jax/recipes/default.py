@@ -26,6 +26,8 @@ class Default(Recipe[DefaultConfig, DefaultParams, DefaultState]):
         "params.registration.inertial_point_spacing": 0.2,
     }
 
+    noise_from_recording = True
+
     def init(self, params: DefaultParams, imu: ImuBatch | None = None) -> DefaultState:
         """Return the state before the first scan; its form depends on whether there are inertial samples."""
         if imu is None:

@@ -205,6 +205,8 @@ class Recipe(ABC, Generic[C, P, S]):
     near_values: ClassVar[Mapping[str, float]] = {}
     """Values by path that replace the defaults where a recording's surroundings are near, m; none: the recipe
     has one set of values for all surroundings."""
+    noise_from_recording: ClassVar[bool] = False
+    """Whether the white noise of the inertial sensor is taken from each recording, where it is not given."""
     given_values: ClassVar[Mapping[str, Any]] = {}
     """Values by path in which the recipe differs from the defaults of the back end and of the runner."""
 

@@ -1,4 +1,4 @@
-"""Settings that follow from a recording's first scans: voxel sizes, and the sensor's rings and columns."""
+"""Settings that follow from a recording: voxel sizes, the sensors' rings and columns, and their noise."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -8,9 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lio_jax.data.imu_checks import cleaned
 from lio_jax.data.sequence import LidarScan, Sequence
+from lio_jax.imu.allan import noise_in_motion
 from lio_jax.lidar.params import RingConfig
 from lio_jax.recipes import recipe_named
+from lio_jax.recipes.params import InertialConfig
 from lio_jax.settings.settings import Settings, declared_settings
 
 _NEAR_M, _SHARE = 10.0, 90
@@ -55,6 +58,43 @@ def _reach(sequence: Sequence) -> float | None:
         if len(ranges):
             return float(np.percentile(ranges, _SHARE))
     return None
+
+
+_NOISE = {"params.imu.gyro_noise": "rad/s/sqrt(Hz)", "params.imu.accel_noise": "m/s^2/sqrt(Hz)"}
+_MARGIN = 1.5
+"""Factor of the noise that is found: errors of scale and alignment act as noise in motion."""
+_QUIETEST = 1 / 30
+"""Least noise as a share of the recipe's own value: a recording that shows less is not believed."""
+
+
+def with_inertial_noise(sequence: Sequence, settings: Settings) -> tuple[Settings, list[str]]:
+    """Return settings with the inertial sensor's white noise as the recording shows it, and a note on it.
+
+    What was given stays. The recipe's own values are for a sensor of which nothing is known: they stay where
+    the recording shows more noise, which is vibration, or where its samples are too few or too slow.
+    """
+    config = settings.config
+    uses_imu = isinstance(config, InertialConfig) and config.imu.use
+    free = [path for path in _NOISE if path not in settings.given]
+    if not recipe_named(settings.recipe).noise_from_recording or not uses_imu or not free:
+        return settings, []
+    recorded = sequence.imu()
+    if recorded is None or not len(recorded.stamp_ns):
+        return settings, []
+    imu = cleaned(recorded, "IMU")[0]
+    seconds = np.asarray((imu.stamp_ns - imu.stamp_ns[:1]) * 1e-9, np.float64)
+    words = []
+    for path in free:
+        _, section, name = path.split(".")
+        found = noise_in_motion(seconds, imu.gyro if name == "gyro_noise" else imu.accel)
+        own = settings.values[section][name]
+        if found is not None and _MARGIN * found < own:
+            value = float(f"{max(_MARGIN * found, _QUIETEST * own):.3g}")
+            settings = settings.with_value(path, value, "the recording's inertial samples")
+            words.append(f"{path.removeprefix('params.')} {value:g} {_NOISE[path]}")
+    if not words:
+        return settings, []
+    return settings, [f"noise of the inertial samples, with a margin of {_MARGIN:g}: {', '.join(words)}."]
 
 
 _LINE_STEP = 0.1

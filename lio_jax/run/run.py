@@ -18,6 +18,7 @@ from lio_jax.recipes.params import InertialConfig
 from lio_jax.run.fitted_settings import (
     fitted_to_surroundings,
     notes_on_rings,
+    with_inertial_noise,
     with_point_order,
     with_sensor_sizes,
 )
@@ -36,9 +37,10 @@ from lio_jax.settings.settings import Settings, with_extrinsics
 
 
 def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list[str]]:
-    """Take from the recording what was not given, and say so: T_imu_lidar, sizes, the order of points."""
+    """Take from the recording what was not given, and say so: calibration, sizes, noise, order of points."""
     settings, calibration = _calibrated(sequence, settings)
     settings, fitted = fitted_to_surroundings(sequence, settings)
+    settings, noise = with_inertial_noise(sequence, settings)
     settings, order = with_point_order(settings, sequence.scans())
     settings, sizes = with_sensor_sizes(settings, sequence.scans())
     rings = notes_on_rings(settings, sequence.scans())
@@ -46,7 +48,7 @@ def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list
         f"config.data.{name} has no effect on a recording of the format {sequence.info.format}; leave it out."
         for name in without_effect(sequence.info.format, settings.run.data)
     ]
-    return settings, [calibration, *fitted, *order, *sizes, *rings, *unused]
+    return settings, [calibration, *fitted, *noise, *order, *sizes, *rings, *unused]
 
 
 def _calibrated(sequence: Sequence, settings: Settings) -> tuple[Settings, str]:

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from lio_jax.imu.allan import NoiseFit, allan_deviation, averaging_factors, fit_noise
+from lio_jax.imu.allan import (
+    NoiseFit,
+    allan_deviation,
+    averaging_factors,
+    fit_noise,
+    noise_in_motion,
+)
+from tests.shared_data import SHARED_DATA, needs_shared
 
 RATE = 50.0
 
@@ -97,3 +104,42 @@ def test_the_fitted_curve_follows_the_deviation():
 def test_a_dead_axis_has_no_noise():
     fit = fitted(np.zeros((3000, 1)))[0]
     assert (fit.white, fit.walk, fit.flicker, fit.quantisation) == (0.0, None, 0.0, 0.0)
+
+
+def driven(rate: float, seconds: float, density: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps and samples of white noise on the turns of a walk and the hum of a motor."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(round(rate * seconds)) / rate
+    steps = np.stack([np.sin(2 * np.pi * f * time + f) for f in (0.3, 1.1, 2.0)], axis=1)
+    return time, 1.0 + 0.5 * steps + rng.normal(0, density * rate**0.5, (len(time), 3))
+
+
+@pytest.mark.parametrize("rate", [100.0, 200.0, 1000.0])
+@pytest.mark.parametrize("density", [2e-3, 2e-2])
+def test_noise_is_found_in_motion(rate, density):
+    assert noise_in_motion(*driven(rate, 30.0, density)) == pytest.approx(density, rel=0.1)
+
+
+def test_gaps_and_a_short_shock_do_not_count():
+    time, samples = driven(200.0, 30.0, 2e-3)
+    samples[2000:2400] += np.random.default_rng(1).normal(0, 20.0, (400, 3))
+    kept = (time < 7.0) | (time > 9.5)
+    assert noise_in_motion(time[kept], samples[kept]) == pytest.approx(2e-3, rel=0.15)
+
+
+def test_no_noise_is_told_of_slow_or_few_samples():
+    assert noise_in_motion(*driven(10.0, 60.0, 2e-3)) is None
+    assert noise_in_motion(*driven(200.0, 2.0, 2e-3)) is None
+    assert noise_in_motion(np.zeros(1), np.zeros((1, 3))) is None
+
+
+@needs_shared
+def test_noise_of_a_real_sensor_at_rest_is_that_of_its_allan_deviation():
+    gyro = np.radians(
+        np.load(SHARED_DATA / "imu_static" / "adis16405_unit1.npz")["gyro_dps"][:60_000].astype(np.float64)
+    )
+    factors = averaging_factors(len(gyro))
+    deviation = allan_deviation(gyro, 0.01, factors)
+    by_allan = [fit_noise(factors * 0.01, column, 600.0).white for column in deviation.T]
+    found = noise_in_motion(np.arange(len(gyro)) * 0.01, gyro)
+    assert found == pytest.approx(np.sqrt(np.mean(np.square(by_allan))), rel=0.2)

@@ -1,14 +1,16 @@
-"""Finer voxels where the surroundings are near, and only where nobody chose."""
+"""Finer voxels where the surroundings are near, and the noise that the samples show, where nobody chose."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from lio_jax.data.sequence import ImuData
 from lio_jax.recipes import RECIPES
 from lio_jax.recipes.default import Default
-from lio_jax.run.fitted_settings import fitted_to_surroundings
-from lio_jax.settings.settings import recipe_settings, with_overrides
+from lio_jax.run.fitted_settings import fitted_to_surroundings, with_inertial_noise
+from lio_jax.settings.settings import Settings, recipe_settings, with_overrides
 from tests.run.small_drive import Replay, moving
 
 
@@ -103,3 +105,41 @@ def test_every_recipe_has_sizes_for_near_surroundings(recipe):
     assert size < 0.6 * settings.values["map"]["voxel_size"]
     assert f"map.voxel_size {size:g}" in notes[0]
     assert fitted_to_surroundings(Seeing(around(30.0)), settings) == (settings, [])
+
+
+def shaken(gyro: float, accel: float, rate: float = 200.0) -> SimpleNamespace:
+    """Return a recording whose inertial samples have this white noise."""
+    rng = np.random.default_rng(0)
+    count = round(10 * rate)
+    samples = ImuData(
+        stamp_ns=np.arange(count, dtype=np.int64) * round(1e9 / rate),
+        gyro=rng.normal(0, gyro * rate**0.5, (count, 3)),
+        accel=rng.normal([0, 0, 9.81], accel * rate**0.5, (count, 3)),
+    )
+    return SimpleNamespace(imu=lambda: samples)
+
+
+def test_the_noise_of_the_samples_is_that_of_the_recording_with_a_margin():
+    settings, notes = with_inertial_noise(shaken(2e-4, 3e-3), Settings())
+    assert settings.values["imu"]["gyro_noise"] == pytest.approx(1.5 * 2e-4, rel=0.1)
+    assert settings.values["imu"]["accel_noise"] == pytest.approx(1.5 * 3e-3, rel=0.1)
+    assert "imu.gyro_noise" in notes[0]
+    assert "imu.accel_noise" in notes[0]
+
+
+def test_given_noise_vibration_and_recipes_with_noise_of_their_own_stay():
+    given = with_overrides(Settings(), ["params.imu.gyro_noise=0.001"])
+    settings, notes = with_inertial_noise(shaken(2e-4, 1.0), given)
+    assert settings == given
+    assert notes == []
+    for recipe in ("fast_lio2", "lio_sam", "loam"):
+        own = recipe_settings(recipe)
+        assert with_inertial_noise(shaken(2e-4, 3e-3), own) == (own, [])
+    slow = with_inertial_noise(shaken(2e-4, 3e-3, rate=10.0), Settings())
+    assert slow == (Settings(), [])
+
+
+def test_samples_without_noise_are_not_believed():
+    settings, _ = with_inertial_noise(shaken(0.0, 0.0), Settings())
+    own = Settings().values["imu"]["gyro_noise"]
+    assert settings.values["imu"]["gyro_noise"] == pytest.approx(own / 30, rel=1e-2)
