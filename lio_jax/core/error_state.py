@@ -142,11 +142,14 @@ class SweptState(eqx.Module):
     """The estimated state at the sweep's end."""
     covariance: Float[Array, "30 30"]
     """Covariance of the 24 entries of the error state, then of the six of ``LAG``."""
+    transition: Float[Array, "30 24"]
+    """Derivative of these entries by the error state from which the state was propagated."""
 
     @staticmethod
     def at_once(state: NavEstimate) -> "SweptState":
         """Return ``state`` for a sweep without duration: its ``LAG`` is zero without uncertainty."""
-        return SweptState(state.nav, jnp.pad(state.covariance, (0, LAG.stop - LAG.start)))
+        covariance = jnp.pad(state.covariance, (0, LAG.stop - LAG.start))
+        return SweptState(state.nav, covariance, jnp.eye(LAG.stop, DOF, dtype=covariance.dtype))
 
     def at_end(self) -> NavEstimate:
         """Return the state at the sweep's end, without ``LAG``."""

@@ -46,6 +46,8 @@ class Update(NamedTuple):
     iterations: Int32[Array, ""]
     status: Int32[Array, ""]
     """See :mod:`lio_jax.core.types`; after LOST and NOT_FINITE state and covariance are the prior's."""
+    considered: Float[Array, "d c"] | None = None
+    """Covariance of the error at ``state`` with the considered errors; None where there are none."""
 
 
 def iterated_update(
@@ -61,6 +63,7 @@ def iterated_update(
     first_aux: Any = None,
     again: Callable[..., Measurement] | None = None,
     reset: Callable[[State, Float[Array, " d"]], Float[Array, "d d"]] | None = None,
+    considered: Float[Array, "d c"] | None = None,
 ) -> Update:
     """Return the state that best agrees with the prior and the measurement together, and its covariance.
 
@@ -97,6 +100,9 @@ def iterated_update(
             choices: its derivative stands for the converged iteration's. ``measure`` where not given.
         reset: ``(state, e) ->`` derivative of ``local(retract(state, e), retract(state, e + w))`` with
             respect to w at zero; by automatic differentiation where not given.
+        considered: covariance of the prior's error with c errors that the measurement does not depend on and
+            that the update does not correct (Schmidt, "Application of state-space methods to navigation
+            problems", 1966).
     """
     reset_at = reset or _reset_by_differentiation(retract, local)
     if first_aux is None:
@@ -179,6 +185,7 @@ def iterated_update(
         measurement=last.measured,
         iterations=loop.iterations,
         status=jnp.where(last.measured.lost, LOST, status).astype(jnp.int32),
+        considered=None if considered is None else unless_idle(kept @ considered, considered),
     )
 
 

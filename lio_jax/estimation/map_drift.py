@@ -1,15 +1,23 @@
-"""The drift of the local map from the world of the first scan.
+"""The error of the local map in the world of the first scan, considered beside the navigation state.
 
 A scan match observes the pose within the map around the vehicle, and not the pose in the world. The new
 points of a scan are added to the map at the estimated pose, and later scans are matched with them. So a part
-of each pose's error stays in the map, and no innovation contains it. A filter that takes its map as exact
-reports the error within the map only; the error of the trajectory is the sum of both.
+of each pose's error stays in the map, and no innovation contains it. Neither does an innovation show that the
+map's planes lie beside the surfaces, because their points are noisy: the next scans meet the same planes.
 
-Let f be the share of a scan that is new to the map, and e the pose's error within the map. The error m of the
-map ahead becomes m' = (1 - f) m + f (m + e) = m + f e. This is a random walk with variance f^2 P per scan.
-The errors e of successive scans are taken as independent, which holds where the match has much more
-information than the prediction. The error of a map of a single scan is that of the match of another scan with
-it.
+Let e be the error of the pose within the map, and m the error of the map around the vehicle, as the error of
+a pose that fits the map exactly. The error of the pose in the world is e + m. When a scan is added whose
+share f is new to the map, then
+
+    m' = (1 - f) m + f (m + e) + n = m + f e + n,        e' = e - f e.
+
+The noise n is that of the new planes. If the planes that the scans meet are renewed at this rate, and the
+pose's error by all of them has the covariance B, then n has the covariance f (2 - f) B. The joint covariance
+of e and m is propagated and updated as that of an estimated and a considered state (Schmidt, "Application of
+state-space methods to navigation problems", 1966): a match corrects the pose, and the map stays where it is.
+
+Neglected: the pose is taken to follow the new planes at once, though inertial samples hold it back; planes
+leave the view and come back later; surfaces are not flat.
 """
 
 import equinox as eqx
@@ -17,68 +25,104 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.error_state import DOF, POSITION, ROTATION, VELOCITY
+from lio_jax.core.error_state import DOF, GRAVITY, POSITION, ROTATION, VELOCITY, NavEstimate, sphere_basis
 from lio_jax.core.geometry import adjoint, from_blocks, rotation_matrix, skew
 from lio_jax.core.types import NavState
+from lio_jax.estimation.pose_measurement import lidar_pose_jacobian
 
 _POSE = slice(ROTATION.start, POSITION.stop)
 
 
 class MapDrift(eqx.Module):
-    """The error of the map around the vehicle."""
+    """The error of the map around the vehicle, as a perturbation of the IMU's pose in world: right
+    perturbation, rotation (rad) before translation (m)."""
 
     covariance: Float[Array, "6 6"]
-    """Covariance of the IMU's pose in world that the map's error causes alone: right perturbation, rotation
-    (rad) before translation (m)."""
+    """Covariance of the map's error."""
+    cross: Float[Array, "24 6"]
+    """Covariance of the state's error within the map with the map's error, in the order of
+    :mod:`lio_jax.core.error_state`."""
 
     @staticmethod
     def none(dtype: jnp.dtype) -> "MapDrift":
         """Return zero drift, that of the first scan's map."""
-        return MapDrift(jnp.zeros((6, 6), dtype))
+        return MapDrift(jnp.zeros((6, 6), dtype), jnp.zeros((DOF, 6), dtype))
 
     def carried(self, T_world_before: jaxlie.SE3, T_world_imu: jaxlie.SE3) -> "MapDrift":
         """Return the drift as seen from another pose in the same map."""
         carry = adjoint(T_world_imu.inverse() @ T_world_before)
-        covariance = carry @ self.covariance @ carry.T
-        return MapDrift((covariance + covariance.T) / 2)
+        return MapDrift(_symmetric(carry @ self.covariance @ carry.T), self.cross @ carry.T)
 
     def grown(
-        self, covariance: Float[Array, "24 24"], share: Float[Array, ""], scans: Int32[Array, ""]
-    ) -> "MapDrift":
-        """Return the drift after a scan was added.
+        self,
+        within: NavEstimate,
+        share: Float[Array, ""],
+        by_planes: Float[Array, "6 6"],
+        scans: Int32[Array, ""],
+    ) -> tuple[NavEstimate, "MapDrift"]:
+        """Return state and drift after a scan was added.
 
         Args:
-            covariance: covariance, within the map, of the state at which the scan was added.
+            within: state at which the scan was added, with the covariance of its error within the map.
             share: share of the scan's points that were new to the map, 0 to 1.
-            scans: number of earlier scans. The first scan defines the world, so its share counts as 0. The
-                match of the second shows the error of the first scan's map, so its share counts as 1.
+            by_planes: covariance B of the pose's error by the planes of the map.
+            scans: number of earlier scans. The first scan defines the world, so it adds no error. All planes
+                that the second one meets are new.
         """
-        share = jnp.select([scans == 0, scans == 1], [0.0, 1.0], share.astype(covariance.dtype))
-        return MapDrift(self.covariance + share**2 * covariance[_POSE, _POSE])
+        dtype = within.covariance.dtype
+        share = jnp.where(scans == 0, 0.0, share.astype(dtype))
+        renewed = jnp.where(scans == 1, 1.0, share)
+        noise = renewed * (2 - renewed) * by_planes
+        # the points lie where the lidar's pose puts them: a wrong extrinsic alone moves none
+        by_lidar = lidar_pose_jacobian(within.nav)
+        into_map = share * jnp.linalg.solve(by_lidar[:, _POSE], by_lidar)
+        kept = jnp.eye(DOF, dtype=dtype) - _moves(within.nav) @ into_map
+        covariance, both = within.covariance, into_map @ self.cross
+        drift = MapDrift(
+            _symmetric(self.covariance + both + both.T + into_map @ covariance @ into_map.T + noise),
+            kept @ (self.cross + covariance @ into_map.T),
+        )
+        covariance = kept @ covariance @ kept.T
+        return NavEstimate(within.nav, _symmetric(covariance)), drift
 
-    def with_pose_of(self, covariance: Float[Array, "24 24"], begins: Bool[Array, ""]) -> "MapDrift":
+    def with_pose_of(
+        self,
+        covariance: Float[Array, "24 24"],
+        begins: Bool[Array, ""],
+        moved: Float[Array, "24 24"] | None = None,
+    ) -> "MapDrift":
         """Return the drift of a new piece of map that begins at an uncertain pose.
 
         Args:
-            covariance: of the state at which it begins, within the map so far.
+            covariance: of the error of the state at which it begins, within the map so far.
             begins: a new piece begins; otherwise the drift stays.
+            moved: derivative of the state's error within the new piece by that error; None: zero.
         """
-        return MapDrift(self.covariance + jnp.where(begins, covariance[_POSE, _POSE], 0.0))
+        both, pose = self.cross[_POSE], covariance[_POSE]
+        whole = _symmetric(self.covariance + both + both.T + pose[:, _POSE])
+        cross = jnp.zeros_like(self.cross) if moved is None else moved @ (self.cross + pose.T)
+        return MapDrift(jnp.where(begins, whole, self.covariance), jnp.where(begins, cross, self.cross))
 
-    def added_to(self, covariance: Float[Array, "24 24"], nav: NavState) -> Float[Array, "24 24"]:
-        """Return the covariance of a state's error in the world, given its covariance within the map.
+    def added_to(self, within: NavEstimate) -> Float[Array, "24 24"]:
+        """Return the covariance of a state's error in the world, given its covariance within the map."""
+        moves = _moves(within.nav)
+        shared = self.cross @ moves.T
+        return _symmetric(within.covariance + moves @ self.covariance @ moves.T + shared + shared.T)
 
-        A rotation of the map rotates the velocity as well as the pose.
 
-        Args:
-            covariance: covariance within the map, in the order of :mod:`lio_jax.core.error_state`.
-            nav: the state.
-        """
-        R_imu_world = rotation_matrix(nav.T_world_imu.rotation()).T
-        dtype = covariance.dtype
-        moves = from_blocks(
-            (DOF, 6),
-            (_POSE, slice(0, 6), jnp.eye(6, dtype=dtype)),
-            (VELOCITY, ROTATION, -skew(R_imu_world @ nav.velocity)),
-        )
-        return covariance + moves @ self.covariance @ moves.T
+def _moves(nav: NavState) -> Float[Array, "24 6"]:
+    """Return the change of a state's error in the world by the map's error.
+
+    A rotation of the map rotates velocity and gravity as well as the pose.
+    """
+    R_world_imu = rotation_matrix(nav.T_world_imu.rotation())
+    return from_blocks(
+        (DOF, 6),
+        (_POSE, slice(0, 6), jnp.eye(6, dtype=R_world_imu.dtype)),
+        (VELOCITY, ROTATION, -skew(R_world_imu.T @ nav.velocity)),
+        (GRAVITY, ROTATION, sphere_basis(nav.gravity).T @ R_world_imu),
+    )
+
+
+def _symmetric(covariance: Array) -> Array:
+    return (covariance + covariance.T) / 2

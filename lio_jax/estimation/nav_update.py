@@ -99,6 +99,7 @@ def update_nav(
     translation_tolerance: Float[Array, ""],
     first_aux: Any = None,
     again: Callable[..., Measurement] | None = None,
+    considered: Float[Array, "30 c"] | None = None,
 ) -> tuple[Update, NavState]:
     """Return the iterated update of a navigation state, and the state with the sweep's mean pose.
 
@@ -115,6 +116,7 @@ def update_nav(
         translation_tolerance: largest translation of a converged step, m, per component.
         first_aux: see :func:`iterated_update`.
         again: see :func:`iterated_update`.
+        considered: covariance of the prior's error with c errors that the update does not correct.
 
     Returns:
         The update, with an :class:`NavEstimate` of the sweep's end as its ``state``, and the state with the
@@ -135,11 +137,14 @@ def update_nav(
         first_aux=first_aux,
         again=again and _AtMean(again),
         reset=_State.reset,
+        considered=considered,
     )
     found: _State = update.state
     turn = reset_jacobian(prior.nav, found.error[:DOF])
     covariance = turn @ update.covariance[:DOF, :DOF] @ turn.T
     end = NavEstimate(found.end(), (covariance + covariance.T) / 2)
+    if update.considered is not None:
+        update = update._replace(considered=turn @ update.considered[:DOF])
     return update._replace(state=end, covariance=end.covariance), found.mean()
 
 

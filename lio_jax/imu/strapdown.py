@@ -167,7 +167,7 @@ def propagate_sweep(
     shown = still_to_show(start, sweep_start, end)
     transition = _transition(nav, increments, path.gravity, effects.by_bias, effects.by_offset, shown)
     covariance = transition @ state.covariance @ transition.T + _placed(effects.noise)
-    return SweptState(moved, (covariance + covariance.T) / 2), path
+    return SweptState(moved, (covariance + covariance.T) / 2, transition), path
 
 
 class _SampledMotion(NamedTuple):

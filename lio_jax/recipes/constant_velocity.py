@@ -91,7 +91,7 @@ def predicted_without_samples(
         sweep_start=scan.duration,
     )
     nav = dataclasses.replace(prior.nav, gravity=last.nav.gravity)
-    return SweptState(nav, prior.covariance), path
+    return SweptState(nav, prior.covariance, prior.transition), path
 
 
 def _imagined_samples(nav: NavState, rate: Float[Array, "3"], scan: Scan) -> ImuBatch:

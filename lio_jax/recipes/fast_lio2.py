@@ -102,7 +102,6 @@ class FastLio2Params(InertialParams):
     registration: FastLio2Match = section(
         FastLio2Match,
         point_spacing=0.5,
-        information_scale=1.0,
         reassociation_distance=0.01,
         rotation_tolerance=1e-3,
         translation_tolerance=1e-3,
@@ -306,7 +305,7 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
             origin=frame.origin,
             thinned_away=thin.dropped,
             map_dropped=added.dropped,
-            covariance=drift.added_to(posterior.covariance, posterior.nav),
+            covariance=drift.added_to(posterior),
             new_piece=new_piece,
             evidence=evidence_of(update, prior),
         )

@@ -22,11 +22,11 @@ from lio_jax.core.error_state import (
     sphere_basis,
 )
 from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
-from lio_jax.core.types import ImuBatch, NavState, Scan
+from lio_jax.core.types import ITERATION_LIMIT, ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import Measurement, Update
 from lio_jax.estimation.map_drift import MapDrift
 from lio_jax.estimation.nav_update import predicted_pose_covariance, update_nav
-from lio_jax.estimation.pose_measurement import keep_observed
+from lio_jax.estimation.pose_measurement import keep_observed, lidar_pose_jacobian
 from lio_jax.imu.initialise import initialise_at_rest
 from lio_jax.imu.path import Path
 from lio_jax.imu.strapdown import propagate_sweep
@@ -140,6 +140,8 @@ class _Measured(eqx.Module):
     """A scan match as a measurement of the navigation state."""
 
     match: ScanMatch[Any, Any]
+    curvature: Float[Array, "6 6"]
+    """Covariance that :func:`_curvature` returns."""
 
     def start(self) -> Trial:
         """Return what the first linearisation starts from."""
@@ -165,27 +167,36 @@ class _Measured(eqx.Module):
         information, gradient, degenerate = keep_observed(
             equations.hessian, equations.gradient, equations.arm_squared, settings.inertial_degeneracy_ratio
         )
+        information = settings.information_scale * information
+        softer = jnp.linalg.inv(jnp.eye(6, dtype=information.dtype) + information @ self.curvature)
+        softened = softer @ information
         return Measurement(
-            information=settings.information_scale * information,
-            gradient=settings.information_scale * gradient,
+            information=(softened + softened.T) / 2,
+            gradient=settings.information_scale * (softer @ gradient),
             lost=equations.matches < settings.min_matches,
             aux=Trial(association, iteration + 1, equations, degenerate),
             settled=match.settled(iteration),
         )
 
 
-def corrected(prior: SweptState, match: ScanMatch[Any, Any], max_iterations: int) -> tuple[Update, NavState]:
+def corrected(
+    prior: SweptState,
+    match: ScanMatch[Any, Any],
+    max_iterations: int,
+    considered: Float[Array, "30 c"] | None = None,
+) -> tuple[Update, NavState]:
     """Return the update by a scan match, and the state with the pose at which the scan lies on the map.
 
     Args:
         prior: predicted state; the match's ``T_predicted`` is its lidar pose.
         match: scan and map.
         max_iterations: bound of the loop.
+        considered: covariance of the prior's error with c errors that the update does not correct.
 
     Returns:
         The update, whose measurement's ``aux`` is the last :class:`Trial`, and the state.
     """
-    measured, settings = _Measured(match), match.registration
+    measured, settings = _Measured(match, _curvature(prior)), match.registration
     return update_nav(
         prior,
         measured.measure,
@@ -194,7 +205,21 @@ def corrected(prior: SweptState, match: ScanMatch[Any, Any], max_iterations: int
         translation_tolerance=settings.translation_tolerance,
         first_aux=measured.start(),
         again=measured.again,
+        considered=considered,
     )
+
+
+def _curvature(prior: SweptState) -> Float[Array, "6 6"]:
+    """Return the covariance of the lidar's pose beyond that of its linear dependence on the state.
+
+    An extrinsic of which little is known and the IMU's pose move the lidar together. Where both are far off,
+    the product of their errors counts (Jazwinski, "Stochastic processes and filtering theory", 1970, section
+    9.3). Without it, scans at rest seem to tell the extrinsic.
+    """
+    sigma = jnp.diagonal(prior.covariance)
+    turn, move = jnp.sum(sigma[EXTRINSIC_ROTATION]), jnp.sum(sigma[EXTRINSIC_TRANSLATION])
+    arm = jnp.sum(prior.nav.T_imu_lidar.translation() ** 2)
+    return jnp.diag(jnp.repeat(jnp.stack([turn**2, turn * (move + turn * arm)]) / 2, 3))
 
 
 def registration_of(update: Update, T_world_lidar: jaxlie.SE3) -> Registration:
@@ -225,6 +250,36 @@ def evidence_of(update: Update, prior: SweptState, points: PointEvidence | None 
     )
 
 
+_WEAKEST = 3e-3
+"""Least information of a direction, as a share of that of all directions, by which the planes' error is
+bounded where the scene leaves the direction open."""
+
+
+def error_by_planes(update: Update, nav: NavState, share: Float[Array, ""]) -> Float[Array, "6 6"]:
+    """Return the covariance of the pose's error by the errors of the planes that a scan met.
+
+    Args:
+        update: by :func:`corrected`.
+        nav: its state.
+        share: the planes' variance as a share of the variance by the scan's own noise.
+
+    Returns:
+        Covariance of the IMU's right perturbation, rotation (rad) before translation (m); zero without a
+        match.
+    """
+    information = update.measurement.information
+    dtype = information.dtype
+    to_metres = (
+        jnp.ones(6, dtype).at[:3].set(jax.lax.rsqrt(update.measurement.aux.equations.arm_squared + 1e-6))
+    )
+    weakest = _WEAKEST * jnp.sum(jnp.diagonal(information) * to_metres**2)
+    matched = (weakest > 0) & (update.status <= ITERATION_LIMIT)
+    by_imu = lidar_pose_jacobian(nav)[:, : POSITION.stop]
+    whole = by_imu.T @ (information + jnp.diag(weakest / to_metres**2)) @ by_imu
+    found = share * jnp.linalg.inv(jnp.where(matched, whole, jnp.eye(6, dtype=dtype)))
+    return jnp.where(matched, (found + found.T) / 2, 0.0)
+
+
 def in_new_piece(
     state: NavEstimate, drift: MapDrift, sweep: Float[Array, ""], begins: Bool[Array, ""]
 ) -> tuple[NavEstimate, MapDrift]:
@@ -248,4 +303,4 @@ def in_new_piece(
     moved = moved.at[POSITION, VELOCITY].set(sweep / 2 * jnp.eye(3, dtype=dtype))
     within = moved @ covariance @ moved.T
     kept = NavEstimate(nav, jnp.where(begins, (within + within.T) / 2, covariance))
-    return kept, drift.with_pose_of(covariance, begins)
+    return kept, drift.with_pose_of(covariance, begins, moved)

@@ -4,6 +4,8 @@ scan -> thin --------> deskew -> iterated update (match, linearise) -> insert ->
 imu  -> propagate --/------------/
 """
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,6 +24,7 @@ from lio_jax.recipes import recipe
 from lio_jax.recipes.default_params import DefaultConfig, DefaultParams
 from lio_jax.recipes.inertial_filter import (
     corrected,
+    error_by_planes,
     evidence_of,
     in_new_piece,
     levelled_start,
@@ -119,8 +122,10 @@ def step(
             prediction_error=state.prediction_error,
             map_params=params.map,
             lidar=params.lidar,
+            with_lines=False,
         )
-        update, matched = corrected(prior, match, config.registration.max_iterations)
+        considered = prior.transition @ state.drift.cross
+        update, matched = corrected(prior, match, config.registration.max_iterations, considered)
         posterior: NavEstimate = update.state
         lost = (update.status > ITERATION_LIMIT) & ~first
         new_piece = outage.begins_piece(lost, params.registration)
@@ -128,7 +133,8 @@ def step(
         frame, matches = match.frame(), update.measurement.aux.association.found
         sigmas = params.lidar, params.registration
         coordinates = matches.coordinates_in(state.map)
-        evidence = point_evidence(matches, to_match, T_matched, frame, *sigmas, coordinates)
+        slots = len(state.map.voxel)
+        evidence = point_evidence(slots, matches, to_match, T_matched, frame, *sigmas, coordinates)
         missed = jnp.linalg.norm((T_predicted.inverse() @ T_matched).translation())
         error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
     with jax.named_scope("insert"):
@@ -141,13 +147,17 @@ def step(
         vmap = following(vmap, state.map, added.added, placed, inserted, again, frame.anchor, size)
 
         new = jnp.sum(added.added) / jnp.maximum(jnp.sum(thin.mask), 1)
-        drift = state.drift.carried(state.nav.T_world_imu, posterior.nav.T_world_imu)
+        assert update.considered is not None
+        drift = replace(state.drift, cross=update.considered)
+        drift = drift.carried(state.nav.T_world_imu, posterior.nav.T_world_imu)
         within, drift = in_new_piece(posterior, drift, scan.duration, new_piece)
+        by_planes = error_by_planes(update, posterior.nav, evidence.plane_share)
+        after, grown = drift.grown(within, new, by_planes, state.scans)
 
     new_state = InertialState(
         nav=within.nav,
-        covariance=within.covariance,
-        drift=drift.grown(within.covariance, new, state.scans),
+        covariance=after.covariance,
+        drift=grown,
         # it only opens the kernel, which is closed at the solution
         prediction_error=jax.lax.stop_gradient(
             jnp.select(
@@ -169,7 +179,7 @@ def step(
         origin=frame.origin,
         thinned_away=thin.dropped,
         map_dropped=added.dropped,
-        covariance=drift.added_to(within.covariance, within.nav),
+        covariance=drift.added_to(within),
         new_piece=new_piece,
         evidence=evidence_of(update, prior, evidence),
     )

@@ -19,6 +19,7 @@ import jaxlie
 from jaxtyping import Array, Float
 
 from lio_jax.core.error_state import DOF as NAV_DOF
+from lio_jax.core.error_state import NavEstimate
 from lio_jax.core.errors import UsageError
 from lio_jax.core.geometry import from_blocks
 from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, ImuBatch, NavState, Scan, state_dtype
@@ -153,7 +154,7 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
             map=added.submap,
         )
         output = _output(nav, clock, features, match, smoothing, added)
-        return new_state, dataclasses.replace(output, covariance=drift.added_to(covariance, nav))
+        return new_state, dataclasses.replace(output, covariance=drift.added_to(NavEstimate(nav, covariance)))
 
 
 def _output(

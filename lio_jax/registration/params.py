@@ -39,9 +39,9 @@ class RobustMatch(RegistrationParams):
 class WeighedMatch(eqx.Module):
     """A match whose information enters a filter or a smoother."""
 
-    information_scale: Scalar = leaf(0.03, above=0, most=1, tuned="log")
-    """Share of the matches' information that the estimator believes. It is below 1, because neighbouring
-    points share the error of the map."""
+    information_scale: Scalar = leaf(1.0, above=0, most=1, tuned="log")
+    """Share of the matches' information that the estimator believes. It is below 1 where neighbouring points
+    share errors of the map that the estimator has no model of."""
 
 
 class GaussNewtonMatch(RegistrationParams):

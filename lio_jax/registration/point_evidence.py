@@ -22,9 +22,19 @@ class PointEvidence(eqx.Module):
     """Weighted sum of the logarithms of the noise's variances (m^2)."""
     scale: Float[Array, ""]
     """Factor of each point's information, ``registration.information_scale``."""
+    plane_share: Float[Array, ""]
+    """Variance of the pose by the planes' errors, as a share of its variance by the scan's own noise."""
+
+
+_PLANE_DOF = 3
+"""A plane through so many points shows none of their noise."""
+_UNSHARED = 2
+"""Number of a plane's three coordinates whose error a scan line across it does not average out: its offset,
+and its tilt across the line."""
 
 
 def point_evidence(
+    slots: int,
     matches: Matches,
     points: Float[Array, "k 3"],
     T_world_lidar: jaxlie.SE3,
@@ -35,7 +45,13 @@ def point_evidence(
 ) -> PointEvidence:
     """Return the statistics of the matched points at a pose, with the weights of the solve.
 
+    A plane through n points with the variance l0 along its normal is off by the variance 2 l0 / (n - 3) where
+    a scan line crosses it, and all points of the scan in its voxel share that error. For the sum of m of them
+    it counts m^2 times, and their own variances v count m times: the plane's share is 2 m l0 / ((n - 3) v).
+    The mean over all points stands for every direction of the pose.
+
     Args:
+        slots: size of the map's table.
         matches: matches of the points.
         points: m, lidar frame.
         T_world_lidar: the solution.
@@ -48,25 +64,36 @@ def point_evidence(
     noise = point_noise(matches, points, T_world_lidar, frame, lidar)
     # as in iteratively reweighted least squares, the weights are no part of the derivative
     weight = jax.lax.stop_gradient(noise.weight(registration.kernel.astype(kind)))
+    shared = jnp.where(matches.used, matches.in_same_voxel(slots), 0).astype(kind)
+    shared *= _UNSHARED / jnp.maximum(matches.count - _PLANE_DOF, 1) / jnp.maximum(jnp.sum(matches.used), 1)
+    each = weight, jax.lax.stop_gradient(shared)
     sums = point_sums(
-        jax.lax.stop_gradient(jnp.sum(_weighted(noise, weight), -1)),
+        jax.lax.stop_gradient(jnp.sum(_each(noise, matches, *each), -1)),
         _rows,
         points,
         *frame.placing(T_world_lidar, kind),
         jnp.stack(point_variances(lidar, kind)),
         coordinates,
-        (matches, weight),
+        (matches, *each),
     ).astype(dtype)
-    squared_error, log_det = sums
-    return PointEvidence(squared_error, log_det, registration.information_scale.astype(dtype))
+    squared_error, log_det, plane_share = sums
+    return PointEvidence(squared_error, log_det, registration.information_scale.astype(dtype), plane_share)
 
 
 def _rows(
-    arm: Array, shift: Array, scales: Array, coordinates: Array | None, constants: tuple[Matches, Array]
+    arm: Array,
+    shift: Array,
+    scales: Array,
+    coordinates: Array | None,
+    constants: tuple[Matches, Array, Array],
 ) -> Array:
-    matches, weight = constants
-    return _weighted(plane_noise(matches.at(coordinates), arm.T, shift, *scales), weight)
+    matches, weight, shared = constants
+    matches = matches.at(coordinates)
+    return _each(plane_noise(matches, arm.T, shift, *scales), matches, weight, shared)
 
 
-def _weighted(noise: PointNoise, weight: Array) -> Array:
-    return weight * jnp.stack([noise.precision * noise.distance**2, jnp.log(noise.variance)])
+def _each(noise: PointNoise, matches: Matches, weight: Array, shared: Array) -> Array:
+    by_point = [noise.precision * noise.distance**2, jnp.log(noise.variance)]
+    return jnp.stack(
+        [*(weight * value for value in by_point), shared * matches.variances[:, 0] / noise.variance]
+    )

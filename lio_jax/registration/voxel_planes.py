@@ -37,6 +37,8 @@ class Matches(eqx.Module):
     """Where the map holds the voxel."""
     used: Bool[Array, " k"]
     """True where a point has a match."""
+    with_lines: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.array(True))
+    """Whether the spread of a scan line by its noise counts as a plane; see :func:`point_noise`."""
 
     def coordinates_in(self, vmap: VoxelMap) -> Float[Array, "k 5"]:
         """Return coordinates of the matches, by which they have a derivative, as functions of their voxels.
@@ -48,6 +50,11 @@ class Matches(eqx.Module):
         held, normal, variances = jax.lax.stop_gradient((moments, self.normal, self.variances))
         known = jnp.concatenate([jnp.zeros_like(normal), variances], -1)
         return with_derivative_of(known, _coordinates, held, normal, moments)
+
+    def in_same_voxel(self, slots: int) -> Int32[Array, " k"]:
+        """Return how many matched points lie in the voxel of each point, out of a map of so many slots."""
+        used = self.used.astype(jnp.int32)
+        return jnp.zeros(slots, jnp.int32).at[self.slot].add(used)[self.slot]
 
     def at(self, coordinates: Float[Array, "k 5"] | None) -> "Matches":
         """Return the same matches as functions of :meth:`coordinates_in`; None: they are constants."""
@@ -150,6 +157,8 @@ _BLUR_KERNEL = 0.5
 class PointNoise(eqx.Module):
     """Each matched point's distance from its plane and the noise of that distance."""
 
+    matched: Bool[Array, " k"]
+    """True where there is a match."""
     arm: Float[Array, "k 3"]
     """Vector from the sensor to each point, in world axes, m."""
     distance: Float[Array, " k"]
@@ -163,7 +172,7 @@ class PointNoise(eqx.Module):
 
     def weight(self, kernel: Float[Array, ""]) -> Float[Array, " k"]:
         """Return the Geman-McClure weights of the noise-scaled distances, zero where there is no match."""
-        return jnp.where(self.precision > 0, (kernel**2 / (kernel**2 + self.scaled_squared)) ** 2, 0.0)
+        return jnp.where(self.matched, (kernel**2 / (kernel**2 + self.scaled_squared)) ** 2, 0.0)
 
     def blur(self, facing: Float[Array, ""]) -> Float[Array, " k"]:
         """Return the Geman-McClure losses of the distances, m^2, with a kernel as narrow as their noise.
@@ -176,7 +185,7 @@ class PointNoise(eqx.Module):
             facing: variance of a point along its plane's normal, m^2.
         """
         wide = _BLUR_KERNEL**2 * facing
-        return jnp.where(self.precision > 0, wide * self.scaled_squared / (wide + self.scaled_squared), 0.0)
+        return jnp.where(self.matched, wide * self.scaled_squared / (wide + self.scaled_squared), 0.0)
 
 
 def point_noise(
@@ -189,11 +198,15 @@ def point_noise(
     """Return the distances of associated points from their planes at a pose, and their noise.
 
     A point is measured along the normal of its voxel, with the precision
-    k = 1 / (s^2 + l0) - 1 / (s^2 + l1), where l0 <= l1 are the two smaller variances of the voxel: what is
-    known about the normal in excess of the next direction. A flat voxel acts as a plane; a shapeless one does
-    not act at all, and neither does a single scan line, whose normal is undefined, with no class boundaries
-    between. The point's own variance s^2 is that of the range and of the surface, plus that of the beam's
-    direction times the squared offset along the surface, which grows with range and grazing incidence.
+    k = 1 / (s^2 + l0) - 1 / (s^2 + m), where l0 <= l1 are the two smaller variances of the voxel and
+    m = max(l0, l1 - r^2): what is known about the normal in excess of the next direction. A flat voxel acts
+    as a plane; a shapeless one does not act at all, and neither does a single scan line, with no class
+    boundaries between. The noise of the ranges spreads a scan line along the beams, by the variance r^2 of
+    range and surface. That spread is no surface: its plane contains the beams, which meet the ground at a
+    small angle, and it presses the scan up or down as soon as the vehicle moves. Where there is nothing else
+    to go by, such planes are better than none: ``with_lines`` takes m = l1. The point's own variance
+    s^2 is r^2 plus that of the beam's direction times the squared offset along the surface, which grows with
+    range and grazing incidence.
     """
     R, shift = frame.placing(T_world_lidar, points.dtype)
     arm = jnp.where(matches.used[:, None], points, 0.0) @ R.T
@@ -210,12 +223,16 @@ def plane_noise(matches: Matches, arm: Array, shift: Array, facing: Array, turni
     along = jnp.sum(arm * matches.normal, -1)
     range_squared = jnp.sum(arm**2, -1)
     across = jnp.maximum(range_squared - along**2, 0.0)
-    variances = (facing + turning * across)[:, None] + matches.variances
+    flat, wide = matches.variances[:, 0], matches.variances[:, 1]
+    by_noise = jnp.where(matches.with_lines, 0.0, facing)
+    shaped = jnp.stack([flat, jnp.maximum(flat, wide - by_noise)], -1)
+    variances = (facing + turning * across)[:, None] + shaped
     known = 1 / variances
     distance = jnp.sum(matches.normal * (arm + shift - matches.mean), -1)
     distance = jnp.where(matches.used, distance, 0.0)
     precision = jnp.where(matches.used, known[:, 0] - known[:, 1], 0.0)
     return PointNoise(
+        matched=matches.used,
         arm=arm,
         distance=distance,
         variance=jnp.where(matches.used, variances[:, 0], 1.0),
@@ -328,15 +345,21 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
     """Expected error of the prediction, m."""
     map_params: VoxelMapParams
     lidar: BeamParams
+    with_lines: bool = eqx.field(static=True, default=True)
+    """Whether scan lines count as planes. They should not where inertial samples predict the pose."""
 
     def together(self, points: Float[Array, "k 3"]) -> tuple[Float[Array, "k 3"], Bool[Array, " k"]]:
         return points, self.mask
 
     def unmatched(self) -> Matches:
-        return no_matches(self.mask, self.map.moments.dtype)
+        return self._counting_lines(no_matches(self.mask, self.map.moments.dtype))
 
     def associate(self, points: Float[Array, "k 3"], T_world_lidar: jaxlie.SE3) -> Matches:
-        return associate(self.map, points, self.mask, T_world_lidar, self.frame(), self.map_params)
+        found = associate(self.map, points, self.mask, T_world_lidar, self.frame(), self.map_params)
+        return self._counting_lines(found)
+
+    def _counting_lines(self, found: Matches) -> Matches:
+        return replace(found, with_lines=jnp.array(self.with_lines))
 
     def linearise(
         self, T_world_lidar: jaxlie.SE3, found: Matches, iteration: Int32[Array, ""]

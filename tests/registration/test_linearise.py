@@ -3,6 +3,8 @@
 The map holds a few voxels far apart, so that the association is the same at every pose tried.
 """
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -13,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.voxel_map import anchor_of, empty_map, insert
 from lio_jax.registration.scan_match import NormalEquations, relative_blur
-from lio_jax.registration.voxel_planes import associate, linearise
+from lio_jax.registration.voxel_planes import associate, linearise, point_noise
 from tests.registration.scenes import map_of, matrix, params_with, pose
 
 VOXEL, SIGMA = 1.2, 0.05
@@ -198,6 +200,24 @@ def test_sums_are_those_of_the_matched_points(kernel):
     np.testing.assert_allclose(found.weight, robust.sum(), rtol=1e-4)
     np.testing.assert_allclose(found.squared_error, (robust * squared).sum(), rtol=1e-3)
     np.testing.assert_allclose(found.arm_squared, (points.astype(float) ** 2).sum(1).mean(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("with_lines", [True, False])
+def test_a_scan_line_that_its_noise_has_spread_is_no_plane_unless_lines_count(with_lines):
+    points, patch = scan(400, 0.3)
+    frame = Frame(*anchor_of(TRUTH.translation(), PARAMS.map.voxel_size))
+    mask = jnp.ones(len(points), bool)
+    matches = associate(MAP, jnp.asarray(points), mask, TRUTH, frame, PARAMS.map)
+    matches = replace(matches, with_lines=jnp.array(with_lines))
+    found = point_noise(matches, jnp.asarray(points), TRUTH, frame, PARAMS.lidar).precision
+    expected = []
+    for held in held_points():
+        flat, wide, _ = np.linalg.eigvalsh(np.cov(held.T, bias=True))
+        wide = wide if with_lines else max(flat, wide - SIGMA**2)
+        expected.append(1 / (SIGMA**2 + flat) - 1 / (SIGMA**2 + wide))
+    np.testing.assert_allclose(found, np.array(expected)[patch], rtol=1e-3, atol=0.05)
+    lines = [number for number, value in enumerate(expected) if value < 1e-9]
+    assert bool(lines) != with_lines
 
 
 def blur(points, patch, T) -> float:

@@ -214,7 +214,9 @@ def test_five_seconds_without_lidar_are_predicted_and_recovered_from(replayed: R
             back: "no scan came for 5.10 s before it: inertial samples predicted the motion."
         }
     assert seen.errors[back:].max() < 0.05
-    assert seen.sigma[-1] < 1.5 * seen.sigma[END - START - 1]
+    # little of what the vehicle sees now is in the map, so both are larger than before
+    assert seen.sigma[back:].max() < 0.05
+    assert np.all(seen.errors[back:] < 3 * seen.sigma[back:])
 
 
 def test_a_force_that_is_not_there_names_speed_and_cause(replayed: Replayer) -> None:

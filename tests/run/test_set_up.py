@@ -141,7 +141,7 @@ def test_a_wrong_rotation_is_named_with_its_size(recipe):
     assert fault["kind"] == "rotation"
     assert "wrong by 6 deg" in fault["sentence"] or "wrong by 5 deg" in fault["sentence"]
     assert verdict["state"] == "doubtful"
-    assert verdict["reasons"] == [fault["sentence"]]
+    assert fault["sentence"] in verdict["reasons"]
 
 
 def test_a_wrong_translation_is_named_with_its_size():

@@ -32,7 +32,7 @@ def verdict_of(settings, results):
 
 
 def test_a_match_that_stays_at_rest_while_the_vehicle_drives_is_noticed():
-    sequence = road("city", 25.0, 0.0, 12)
+    sequence = road("city", 40.0, 0.0, 12)
     settings, results = tracked(sequence, "default", [AT_REST])
     poses, truth = relative(results, sequence)
     assert steps(poses).sum() < 0.5 * steps(truth).sum()
