@@ -11,10 +11,10 @@ from systems import Pose
 
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.lidar.params import RingConfig
-from lio_jax.run.fitted_settings import with_sensor_sizes
+from lio_jax.run.fitted_settings import with_inertial_noise, with_sensor_sizes
 from lio_jax.run.run import imu_feed
 from lio_jax.run.scan_inputs import bucket_for
-from lio_jax.run.track import CompiledStep, track
+from lio_jax.run.track import CompiledStep, pose_matrix, run_steps, scan_inputs
 from lio_jax.settings.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 
 _OPENING = 3
@@ -56,7 +56,7 @@ class LioJaxSystem:
         self.estimates: list[tuple[int, Pose]] = []
         """Start stamp and pose of each scan that was answered: the first one with the second."""
         imu = imu_feed(inertial, settings)[0] if inertial is not None else None
-        self._results = track(settings, self._feed(), imu, step)
+        self._results = run_steps(step, scan_inputs(settings, self._feed(), imu))
 
     def warm_up(self, scans: list[LidarScan]) -> None:
         sizes: set[int] = set()
@@ -77,7 +77,8 @@ class LioJaxSystem:
             self._begun = True
             return np.eye(4)
         while self._waiting:
-            pose: Pose = next(self._results).T_world_imu @ self._T_imu_lidar
+            _, state, _ = next(self._results)
+            pose: Pose = pose_matrix(np.asarray(state.nav.T_world_imu.wxyz_xyz)) @ self._T_imu_lidar
             self.estimates.append((self._waiting.pop(0).stamp_ns, pose))
         return pose
 
@@ -99,9 +100,17 @@ def sizes_for(recipe: str, scans: list[LidarScan]) -> tuple[str, ...]:
     )
 
 
+def noise_for(recipe: str, sequence: Sequence) -> tuple[str, ...]:
+    """Return as overrides the noise of the inertial samples that a recipe takes from the recording."""
+    fitted = with_inertial_noise(sequence, recipe_settings(recipe))[0]
+    return tuple(f"params.imu.{name}={fitted.values['imu'][name]}" for name in ("gyro_noise", "accel_noise"))
+
+
 @cache
 def _compiled(T_imu_lidar: bytes, recipe: str, overrides: tuple[str, ...]) -> tuple[Settings, CompiledStep]:
     """Return settings and the step that all passes over a recording share, so that it is compiled once."""
     matrix = np.frombuffer(T_imu_lidar, np.float64).reshape(4, 4)
     settings = with_overrides(with_extrinsics(recipe_settings(recipe), matrix, "recording"), overrides)
+    # a scan comes with register(): none can be read ahead
+    settings = with_overrides(settings, ["config.data.prefetch=0"])
     return settings, CompiledStep(settings)

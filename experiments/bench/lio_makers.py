@@ -43,12 +43,12 @@ def peer(name: str, threads: int, recording: Path) -> System:
 
 def ours(recipe: str, overrides: tuple[str, ...], threads: int, recording: Path) -> System:
     """Return a new instance of one of our recipes."""
-    from lio_jax_system import LioJaxSystem, sizes_for
+    from lio_jax_system import LioJaxSystem, noise_for, sizes_for
 
     sequence = NativeSequence(recording, DataConfig())
     extrinsic = sequence.info.T_imu_lidar
     assert extrinsic is not None
-    overrides = (*sizes_for(recipe, list(sequence.scans(0, 10))), *overrides)
+    overrides = (*sizes_for(recipe, list(sequence.scans(0, 10))), *noise_for(recipe, sequence), *overrides)
     return LioJaxSystem(threads, np.asarray(extrinsic), overrides, sequence, recipe)
 
 
