@@ -88,6 +88,11 @@ def test_the_settings_of_the_run_count():
     keyframes, truth, odometry = city("same way")
     proposal = proposed(keyframes, truth, odometry, nearest(truth), 500.0)
     verdict = verify(proposal, keyframes, odometry, SETTINGS)
+    # the odometry's filter has a model of what neighbouring points share, and an alignment has none
+    doubting = SETTINGS.with_value("params.registration.information_scale", 0.1, "test")
+    np.testing.assert_array_equal(
+        verify(proposal, keyframes, odometry, doubting).information, verdict.information
+    )
     blunt = SETTINGS.with_value("params.lidar.range_sigma", 0.5, "test")
     assert not np.array_equal(verify(proposal, keyframes, odometry, blunt).information, verdict.information)
 
