@@ -21,6 +21,7 @@ leave the view and come back later; surfaces are not flat.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
@@ -108,6 +109,40 @@ class MapDrift(eqx.Module):
         moves = _moves(within.nav)
         shared = self.cross @ moves.T
         return _symmetric(within.covariance + moves @ self.covariance @ moves.T + shared + shared.T)
+
+
+_WEAKEST = 3e-3
+"""Least information of a direction, as a share of that of all directions, by which the planes' error is
+bounded where the scene leaves the direction open."""
+
+
+def error_by_planes(
+    information: Float[Array, "6 6"],
+    arm_squared: Float[Array, ""],
+    nav: NavState,
+    share: Float[Array, ""],
+) -> Float[Array, "6 6"]:
+    """Return the covariance of the pose's error by the errors of the planes that a scan met.
+
+    Args:
+        information: of the scan match, with the perturbation of :func:`lidar_pose_jacobian`; zero without a
+            match.
+        arm_squared: mean squared distance of the points from the sensor, m^2.
+        nav: state at which the scan lies on the map.
+        share: the planes' variance as a share of the variance by the scan's own noise.
+
+    Returns:
+        Covariance of the IMU's right perturbation, rotation (rad) before translation (m); zero without a
+        match.
+    """
+    dtype = information.dtype
+    to_metres = jnp.ones(6, dtype).at[:3].set(jax.lax.rsqrt(arm_squared + 1e-6))
+    weakest = _WEAKEST * jnp.sum(jnp.diagonal(information) * to_metres**2)
+    matched = weakest > 0
+    by_imu = lidar_pose_jacobian(nav)[:, _POSE]
+    whole = by_imu.T @ (information + jnp.diag(weakest / to_metres**2)) @ by_imu
+    found = share * jnp.linalg.inv(jnp.where(matched, whole, jnp.eye(6, dtype=dtype)))
+    return jnp.where(matched, _symmetric(found), 0.0)
 
 
 def _moves(nav: NavState) -> Float[Array, "24 6"]:

@@ -8,7 +8,7 @@ Xu, Cai, He, Lin & Zhang, "FAST-LIO2: Fast direct LiDAR-inertial odometry", T-RO
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -42,17 +42,18 @@ from lio_jax.recipes.inertial_filter import (
     in_new_piece,
     levelled_start,
     lidar_pose,
+    planes_met,
     predicted,
     registration_of,
 )
 from lio_jax.recipes.params import InertialConfig, InertialParams
 from lio_jax.recipes.recipe import Needs, Outage, Output, Recipe
-from lio_jax.registration.knn_planes import ScanToPoints
+from lio_jax.registration.knn_planes import PLANE_SHARE, ScanToPoints
 from lio_jax.registration.params import (
     FilterMatch,
     KnnConfig,
     RegistrationConfig,
-    ScoredFitParams,
+    ScoredPlaneFitParams,
     ThinnedMatch,
 )
 from lio_jax.registration.scan_match import FixedPoints
@@ -107,7 +108,7 @@ class FastLio2Params(InertialParams):
         translation_tolerance=1e-3,
         inertial_degeneracy_ratio=0.0,
     )
-    knn: ScoredFitParams = section(ScoredFitParams)
+    knn: ScoredPlaneFitParams = section(ScoredPlaneFitParams)
     point_map: MovingCubeParams = section(MovingCubeParams)
 
 
@@ -126,6 +127,9 @@ class FilterConfig:
     point_filter_num: int = static(3, above=0)
     """One point of so many is used, counted in the recording's order. A divisor of the number of beams would
     leave whole beams out where the points of a firing follow each other."""
+    exact_map: bool = static(False)
+    """Whether the map counts as free of errors, as FAST-LIO2 takes it. The covariance of the pose is then far
+    too small, and stays so however long the drive is."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +159,8 @@ class FastLio2State(recipe.State):
     scans: Int32[Array, ""]
     """Number of scans with points so far."""
     drift: MapDrift
-    """Errors of the predicted poses at which pieces of the map began."""
+    """Error of the map around the vehicle. If the map is taken for exact, it is that of the predicted poses
+    at which its pieces began."""
     unmatched: Float[Array, ""]
     """Time since the last scan that was matched, s."""
     map: PointMap
@@ -255,8 +260,11 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
                 lidar=params.lidar,
                 origin=frame,
                 neighbours=config.knn.neighbours,
+                # without inertial samples such planes are better than none
+                least_width=0.0 if imu is None else params.knn.least_width * params.map.voxel_size,
             )
-            update, _ = corrected(prior, match, config.registration.max_iterations)
+            considered = None if config.fast_lio2.exact_map else prior.transition @ state.drift.cross
+            update, _ = corrected(prior, match, config.registration.max_iterations, considered)
             posterior: NavEstimate = update.state
             lost = (update.status > ITERATION_LIMIT) & ~first
             new_piece = outage.begins_piece(lost, params.registration)
@@ -280,17 +288,25 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
             cube_map = move_cube(inserted, frame.anchor, *in_blocks)
             cube_map = following(cube_map, state.map, inserted, added.added, moving, frame.anchor, voxel_size)
 
-        drift = state.drift.carried(state.uncertain.nav.T_world_imu, posterior.nav.T_world_imu)
+        drift = state.drift
+        if update.considered is not None:
+            drift = replace(drift, cross=update.considered)
+        drift = drift.carried(state.uncertain.nav.T_world_imu, posterior.nav.T_world_imu)
         posterior, drift = in_new_piece(posterior, drift, jnp.zeros_like(to_end), new_piece)
+        after, grown = posterior, drift
+        if not config.fast_lio2.exact_map:
+            new = jnp.sum(added.added) / jnp.maximum(jnp.sum(thin.mask), 1)
+            by_planes = planes_met(update, posterior.nav, jnp.full_like(to_end, PLANE_SHARE))
+            after, grown = drift.grown(posterior, new, by_planes, state.scans)
         seen = jnp.any(thin.mask)
         rate = jnp.where(first | lost, rate, mean_rate(state.uncertain.nav, posterior.nav, scan))
         new_state = FastLio2State(
             nav=carried_on(posterior.nav, rate, to_end) if imu is None else posterior.nav,
-            uncertain=posterior,
+            uncertain=after,
             rate=rate,
             to_end=to_end,
             scans=state.scans + seen.astype(jnp.int32),
-            drift=drift,
+            drift=grown,
             unmatched=outage.after((first & ~seen) | (lost & ~new_piece)),
             map=cube_map,
         )

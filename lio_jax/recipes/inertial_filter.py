@@ -24,9 +24,9 @@ from lio_jax.core.error_state import (
 from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
 from lio_jax.core.types import ITERATION_LIMIT, ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import Measurement, Update
-from lio_jax.estimation.map_drift import MapDrift
+from lio_jax.estimation.map_drift import MapDrift, error_by_planes
 from lio_jax.estimation.nav_update import predicted_pose_covariance, update_nav
-from lio_jax.estimation.pose_measurement import keep_observed, lidar_pose_jacobian
+from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.imu.initialise import initialise_at_rest
 from lio_jax.imu.path import Path
 from lio_jax.imu.strapdown import propagate_sweep
@@ -250,34 +250,13 @@ def evidence_of(update: Update, prior: SweptState, points: PointEvidence | None 
     )
 
 
-_WEAKEST = 3e-3
-"""Least information of a direction, as a share of that of all directions, by which the planes' error is
-bounded where the scene leaves the direction open."""
-
-
-def error_by_planes(update: Update, nav: NavState, share: Float[Array, ""]) -> Float[Array, "6 6"]:
-    """Return the covariance of the pose's error by the errors of the planes that a scan met.
-
-    Args:
-        update: by :func:`corrected`.
-        nav: its state.
-        share: the planes' variance as a share of the variance by the scan's own noise.
-
-    Returns:
-        Covariance of the IMU's right perturbation, rotation (rad) before translation (m); zero without a
-        match.
-    """
-    information = update.measurement.information
-    dtype = information.dtype
-    to_metres = (
-        jnp.ones(6, dtype).at[:3].set(jax.lax.rsqrt(update.measurement.aux.equations.arm_squared + 1e-6))
+def planes_met(update: Update, nav: NavState, share: Float[Array, ""]) -> Float[Array, "6 6"]:
+    """Return :func:`error_by_planes` of an update by :func:`corrected`; zero where the scan is lost."""
+    measured = update.measurement
+    used = update.status <= ITERATION_LIMIT
+    return error_by_planes(
+        jnp.where(used, measured.information, 0.0), measured.aux.equations.arm_squared, nav, share
     )
-    weakest = _WEAKEST * jnp.sum(jnp.diagonal(information) * to_metres**2)
-    matched = (weakest > 0) & (update.status <= ITERATION_LIMIT)
-    by_imu = lidar_pose_jacobian(nav)[:, : POSITION.stop]
-    whole = by_imu.T @ (information + jnp.diag(weakest / to_metres**2)) @ by_imu
-    found = share * jnp.linalg.inv(jnp.where(matched, whole, jnp.eye(6, dtype=dtype)))
-    return jnp.where(matched, (found + found.T) / 2, 0.0)
 
 
 def in_new_piece(

@@ -24,11 +24,11 @@ from lio_jax.recipes import recipe
 from lio_jax.recipes.default_params import DefaultConfig, DefaultParams
 from lio_jax.recipes.inertial_filter import (
     corrected,
-    error_by_planes,
     evidence_of,
     in_new_piece,
     levelled_start,
     lidar_pose,
+    planes_met,
     predicted,
     registration_of,
 )
@@ -151,7 +151,7 @@ def step(
         drift = replace(state.drift, cross=update.considered)
         drift = drift.carried(state.nav.T_world_imu, posterior.nav.T_world_imu)
         within, drift = in_new_piece(posterior, drift, scan.duration, new_piece)
-        by_planes = error_by_planes(update, posterior.nav, evidence.plane_share)
+        by_planes = planes_met(update, posterior.nav, evidence.plane_share)
         after, grown = drift.grown(within, new, by_planes, state.scans)
 
     new_state = InertialState(

@@ -18,8 +18,10 @@ from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, following, insert
 from lio_jax.recipes import recipe
 from lio_jax.recipes.default_params import DefaultConfig, DefaultParams
+from lio_jax.recipes.lidar_covariance import LidarCovariance, ScanOnMap, mean_squared_range
 from lio_jax.recipes.recipe import Outage, Output
-from lio_jax.registration.gauss_newton import gauss_newton
+from lio_jax.registration.gauss_newton import gauss_newton_with_matches
+from lio_jax.registration.point_evidence import plane_share
 from lio_jax.registration.voxel_planes import ScanToVoxels
 
 
@@ -40,6 +42,7 @@ class LidarState(recipe.State):
     """Number of scans with points so far."""
     unmatched: Float[Array, ""]
     """Time since the last scan that was matched, s."""
+    uncertain: LidarCovariance
     map: VoxelMap
 
     def varying_map(self) -> VoxelMap:
@@ -69,6 +72,7 @@ def init(config: DefaultConfig, params: DefaultParams) -> LidarState:
         prediction_error=jnp.asarray(params.motion.initial_error, dtype),
         scans=jnp.int32(0),
         unmatched=jnp.zeros((), dtype),
+        uncertain=LidarCovariance.at_start(dtype),
         map=empty_map(config.map.capacity),
     )
 
@@ -110,7 +114,7 @@ def step(
             map_params=params.map,
             lidar=params.lidar,
         )
-        result = gauss_newton(match, config.registration.max_iterations)
+        result, matches = gauss_newton_with_matches(match, config.registration.max_iterations)
         lost = (result.status == LOST) & ~first
         new_piece = outage.begins_piece(lost, params.registration)
         twist = jnp.where(lost, motion.last_twist, motion.twist_to(T_last.inverse() @ result.T_world_lidar))
@@ -130,6 +134,20 @@ def step(
         )
         vmap = following(vmap, state.map, added.added, anchored, inserted, placing, anchor, size)
 
+    with jax.named_scope("covariance"):
+        matched = match.points_at(T)
+        on_map = ScanOnMap(
+            match=result,
+            degeneracy_ratio=params.registration.degeneracy_ratio,
+            arm_squared=mean_squared_range(matched, thin.matched.mask, error.dtype),
+            plane_share=plane_share(len(state.map.voxel), matches, matched, T, match.frame(), params.lidar),
+            added=jnp.sum(added.added) / jnp.maximum(jnp.sum(thin.mask), 1),
+            lost=lost,
+            new_piece=new_piece,
+        )
+        T_imu_lidar = params.extrinsics.T_imu_lidar()
+        uncertain, covariance = state.uncertain.after(motion, T_last, twist, on_map, state.scans, T_imu_lidar)
+
     T_world_imu = T @ jaxlie.SE3.exp(motion.middle * twist) @ params.extrinsics.T_imu_lidar().inverse()
     nav = eqx.tree_at(
         lambda nav: (nav.T_world_imu, nav.velocity),
@@ -145,6 +163,7 @@ def step(
         prediction_error=error,
         scans=state.scans + seen.astype(jnp.int32),
         unmatched=outage.after((first & ~seen) | (lost & ~new_piece)),
+        uncertain=uncertain,
         map=vmap,
     )
     return new_state, Output(
@@ -158,6 +177,7 @@ def step(
         origin=corner,
         thinned_away=thin.dropped,
         map_dropped=added.dropped,
+        covariance=covariance,
         new_piece=new_piece,
     )
 

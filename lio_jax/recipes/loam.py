@@ -42,10 +42,12 @@ from lio_jax.mapping.feature_map import (
 )
 from lio_jax.mapping.params import CubeGridParams, FeatureMapParams, MapConfig, PointMapParams
 from lio_jax.recipes import recipe
+from lio_jax.recipes.lidar_covariance import LidarCovariance, ScanOnMap, mean_squared_range
 from lio_jax.recipes.params import RecipeConfig, RecipeParams
 from lio_jax.recipes.recipe import Needs, Outage, Output, Recipe
 from lio_jax.registration.feature_match import ScanToCubes
 from lio_jax.registration.gauss_newton import Registration, gauss_newton
+from lio_jax.registration.knn_planes import PLANE_SHARE
 from lio_jax.registration.params import (
     GaussNewtonMatch,
     KnnConfig,
@@ -139,6 +141,7 @@ class LoamState(recipe.State):
     """Number of scans with points so far."""
     unmatched: Float[Array, ""]
     """Time since the last scan that was matched, s."""
+    uncertain: LidarCovariance
     map: Targets
 
     def varying_map(self) -> Targets:
@@ -185,6 +188,7 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             twist=twist_without_turn(nav.velocity, nav.T_imu_lidar),
             scans=jnp.int32(0),
             unmatched=jnp.zeros((), dtype),
+            uncertain=LidarCovariance.at_start(dtype),
             map=Targets(
                 empty_feature_map(config.map.capacity),
                 empty_scan(corners, features.surface_points, features.rings),
@@ -260,15 +264,31 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
                 params.cubes,
             )
 
+        with jax.named_scope("covariance"):
+            matched, mask = thin.together()
+            on_map = ScanOnMap(
+                match=mapping,
+                degeneracy_ratio=params.registration.degeneracy_ratio,
+                arm_squared=mean_squared_range(matched, mask, middle.dtype),
+                plane_share=jnp.full_like(middle, PLANE_SHARE),
+                added=sum(jnp.sum(one.added) for one in added) / jnp.maximum(jnp.sum(mask), 1),
+                lost=lost,
+                new_piece=new_piece,
+            )
+            T_last, T_imu_lidar = state.T_map_odom @ state.T_odom_lidar, params.extrinsics.T_imu_lidar()
+            uncertain, covariance = state.uncertain.after(
+                motion, T_last, twist, on_map, state.scans, T_imu_lidar
+            )
+
         T_world_imu = T @ jaxlie.SE3.exp(middle * twist) @ params.extrinsics.T_imu_lidar().inverse()
         velocity = T_world_imu.rotation() @ (params.extrinsics.T_imu_lidar().adjoint() @ twist)[:3]
         nav = dataclasses.replace(state.nav, T_world_imu=jaxlie.SE3(T_world_imu.wxyz_xyz), velocity=velocity)
         # a scan too poor to be matched with leaves the last one in its place
-        of_odometry = T_odom_lidar, middle, last
+        of_odometry = T_odom_lidar, middle, last, uncertain
         of_odometry = jax.tree.map(
             lambda new, old: jnp.where(enough, new, old),
             of_odometry,
-            (state.T_odom_lidar, motion.to_end, state.map.last),
+            (state.T_odom_lidar, motion.to_end, state.map.last, state.uncertain),
         )
         new_state = LoamState(
             nav=nav,
@@ -280,6 +300,7 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             unmatched=outage.after((first & ~jnp.any(features.less_flat.mask)) | (lost & ~new_piece)).astype(
                 state.unmatched.dtype
             ),
+            uncertain=of_odometry[3],
             map=Targets(cubes, of_odometry[2]),
         )
         corner_offset = (frames.corner.origin - frames.surface.origin).astype(placed.corner.dtype)
@@ -294,6 +315,7 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             origin=frames.surface.origin,
             thinned_away=thinned_away + features.dropped,
             map_dropped=added[0].dropped + added[1].dropped,
+            covariance=covariance,
             new_piece=new_piece,
             corners=jnp.arange(len(placed.corner_mask) + len(placed.surface_mask)) < len(placed.corner_mask),
         )

@@ -59,9 +59,10 @@ class Output(eqx.Module):
     corners: Bool[Array, " m"] | None = None
     """True for ``points`` that are corners, False for surface points; None from recipes without features."""
     covariance: Float[Array, "24 24"] | None = None
-    """Covariance of the navigation state's error in the world; None from recipes without a covariance."""
+    """Covariance of the navigation state's error in the world. Without inertial samples it holds pose and
+    velocity, and zeros otherwise. None from recipes without a covariance."""
     evidence: Evidence | None = None
-    """Statistics of the match; None from recipes without a covariance."""
+    """Statistics of the match as an update of the prediction; None from recipes without a filter."""
     log_evidence: Float[Array, ""] | None = None
     """Log marginal likelihood of all measurements since the smoother's start; None without a smoother."""
     too_few_features: Bool[Array, ""] | None = None

@@ -3,7 +3,7 @@
 A step turns a pose about its own position and moves it, in the axes of the frame it is given in.
 """
 
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -16,6 +16,9 @@ from lio_jax.core.implicit import ImplicitSolution, Problem, implicit
 from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, LOST
 from lio_jax.registration.params import GaussNewtonMatch, RegistrationParams
 from lio_jax.registration.scan_match import Association, NormalEquations, ScanMatch
+
+F = TypeVar("F")
+"""What each point was matched with."""
 
 
 class Registration(eqx.Module):
@@ -98,6 +101,13 @@ def gauss_newton(match: ScanMatch[Any, Any], max_searches: int, max_steps: int =
         max_searches: bound of the outer loop.
         max_steps: Gauss-Newton steps at most after each search.
     """
+    return gauss_newton_with_matches(match, max_searches, max_steps)[0]
+
+
+def gauss_newton_with_matches(
+    match: ScanMatch[Any, F], max_searches: int, max_steps: int = 1
+) -> tuple[Registration, F]:
+    """Return the result of :func:`gauss_newton` and the last matches, which have no derivative."""
     problem = Problem(
         lambda inputs: _solve(max_steps, *inputs),
         lambda step, end, inputs: _linearised_again(step, end, inputs[1]),
@@ -105,7 +115,8 @@ def gauss_newton(match: ScanMatch[Any, Any], max_searches: int, max_steps: int =
         lambda step, equations, end, inputs: equations,
     )
     step, end, equations = implicit(problem, (jnp.asarray(max_searches, jnp.int32), match))
-    return _registration_at(moved(end.T_world_lidar, step), equations, end, match)
+    found = jax.lax.stop_gradient(end.association.found)
+    return _registration_at(moved(end.T_world_lidar, step), equations, end, match), found
 
 
 class _End(eqx.Module):

@@ -99,6 +99,15 @@ class ScoredFitParams(KnnParams):
     """A match counts if its score is above this."""
 
 
+class ScoredPlaneFitParams(ScoredFitParams):
+    """Planes with scores, as FAST-LIO2 has them."""
+
+    least_width: Scalar = leaf(0.4, least=0)
+    """Neighbours whose second largest standard deviation is below this share of the map's voxel size lie on a
+    line, such as a sensor's ring on the ground, and define no plane. 0 with FAST-LIO2 itself, and without
+    inertial samples."""
+
+
 class ScoredLineFitParams(LineFitParams, ScoredFitParams):
     """Lines and planes with scores, as LIO-SAM has them."""
 

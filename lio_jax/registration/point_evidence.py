@@ -45,11 +45,6 @@ def point_evidence(
 ) -> PointEvidence:
     """Return the statistics of the matched points at a pose, with the weights of the solve.
 
-    A plane through n points with the variance l0 along its normal is off by the variance 2 l0 / (n - 3) where
-    a scan line crosses it, and all points of the scan in its voxel share that error. For the sum of m of them
-    it counts m^2 times, and their own variances v count m times: the plane's share is 2 m l0 / ((n - 3) v).
-    The mean over all points stands for every direction of the pose.
-
     Args:
         slots: size of the map's table.
         matches: matches of the points.
@@ -64,9 +59,7 @@ def point_evidence(
     noise = point_noise(matches, points, T_world_lidar, frame, lidar)
     # as in iteratively reweighted least squares, the weights are no part of the derivative
     weight = jax.lax.stop_gradient(noise.weight(registration.kernel.astype(kind)))
-    shared = jnp.where(matches.used, matches.in_same_voxel(slots), 0).astype(kind)
-    shared *= _UNSHARED / jnp.maximum(matches.count - _PLANE_DOF, 1) / jnp.maximum(jnp.sum(matches.used), 1)
-    each = weight, jax.lax.stop_gradient(shared)
+    each = weight, jax.lax.stop_gradient(_shared(slots, matches, kind))
     sums = point_sums(
         jax.lax.stop_gradient(jnp.sum(_each(noise, matches, *each), -1)),
         _rows,
@@ -78,6 +71,37 @@ def point_evidence(
     ).astype(dtype)
     squared_error, log_det, plane_share = sums
     return PointEvidence(squared_error, log_det, registration.information_scale.astype(dtype), plane_share)
+
+
+def plane_share(
+    slots: int,
+    matches: Matches,
+    points: Float[Array, "k 3"],
+    T_world_lidar: jaxlie.SE3,
+    frame: Frame,
+    lidar: BeamParams,
+) -> Float[Array, ""]:
+    """Return ``PointEvidence.plane_share`` alone, without a derivative.
+
+    A plane through n points with the variance l0 along its normal is off by the variance 2 l0 / (n - 3) where
+    a scan line crosses it, and all points of the scan in its voxel share that error. For the sum of m of them
+    it counts m^2 times, and their own variances v count m times: the plane's share is 2 m l0 / ((n - 3) v).
+    The mean over all points stands for every direction of the pose.
+
+    Args: as for :func:`point_evidence`.
+    """
+    settings = matches, points, T_world_lidar, lidar
+    matches, points, T_world_lidar, lidar = jax.lax.stop_gradient(settings)
+    noise = point_noise(matches, points, T_world_lidar, frame, lidar)
+    shared = _shared(slots, matches, points.dtype)
+    return jnp.sum(shared * matches.variances[:, 0] / noise.variance).astype(T_world_lidar.wxyz_xyz.dtype)
+
+
+def _shared(slots: int, matches: Matches, kind: jnp.dtype) -> Float[Array, " k"]:
+    """Return 2 m / (n - 3) of each point's voxel, divided by the number of matched points."""
+    together = jnp.where(matches.used, matches.in_same_voxel(slots), 0).astype(kind)
+    alone = _UNSHARED / jnp.maximum(matches.count - _PLANE_DOF, 1)
+    return together * alone / jnp.maximum(jnp.sum(matches.used), 1)
 
 
 def _rows(

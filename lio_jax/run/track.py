@@ -53,6 +53,8 @@ class ScanResult:
     """What plan views show of the motion since an earlier scan; None where it was not compared."""
     motion_is_hidden: bool | None = None
     """Whether that comparison shows no motion without doubt; None where nothing was compared."""
+    has_imu: bool = False
+    """Whether inertial samples predicted the pose."""
     outage: BridgedOutage | None = None
     """The outage after which a new piece of map begins with this scan."""
     raw: NDArray[np.float32] | None = None
@@ -219,6 +221,7 @@ class ResultBuilder:
             beams=None if fed.index % _BEAMS_EVERY else beams_of(fed.scan),
             shown_motion=look.shown,
             motion_is_hidden=look.is_hidden,
+            has_imu=fed.imu is not None,
             outage=self._outages(fed.end_ns, evidence, output.covariance),
             raw=_some(np.asarray(fed.scan.points)[: fed.count]),
         )

@@ -191,7 +191,7 @@ class Verdict(Sink):
         if not weak and not lost:
             seen.observed_s, seen.unobserved_m = self._now_s, 0.0
         seen.unobserved_m += step * weak
-        if sigma is None and seen.unobserved_m > max(_UNOBSERVED_M, TOLERATED_SHARE * seen.way):
+        if not result.has_imu and seen.unobserved_m > max(_UNOBSERVED_M, TOLERATED_SHARE * seen.way):
             self._doubt(
                 "unobserved",
                 f"up to {self._now_s:.1f} s the scene left a direction unobserved over "
@@ -208,7 +208,7 @@ class Verdict(Sink):
     def _note_hidden(self, result: ScanResult, step: float) -> None:
         """Add up the way along which nothing but the recipe's own match shows the motion."""
         seen, shown = self._seen, result.shown_motion
-        if result.output.covariance is not None:
+        if result.has_imu:
             return
         if shown is not None:
             seen.shown_step = shown.way / shown.scans

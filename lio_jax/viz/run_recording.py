@@ -104,6 +104,9 @@ def _biases(tracked: ScanResult) -> dict[str, NDArray[np.float64]]:
         ("state/gyro_bias", nav.gyro_bias, GYRO_BIAS),
         ("state/accel_bias", nav.accel_bias, ACCEL_BIAS),
     ):
+        # without inertial samples there are no biases
+        if not sigma[part].any():
+            continue
         values |= {f"{name}/value": np.asarray(bias), f"{name}/sigma": sigma[part]}
     return values
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from lio_jax.mapping.frame import Frame
-from lio_jax.mapping.point_map import EDGE, empty_map
+from lio_jax.mapping.point_map import EDGE, empty_map, insert
 from lio_jax.mapping.voxel_map import anchor_of
 from lio_jax.registration.knn_planes import associate, fit_planes, linearise, no_planes
 from lio_jax.registration.scan_match import associated, no_association
@@ -28,7 +28,8 @@ FRAME = Frame(*anchor_of(POSE.translation(), EDGE * PARAMS.map.voxel_size))
 
 @partial(jax.jit, static_argnums=6)
 def _associate(pmap, points, mask, T, frame, params, neighbours):
-    return associate(pmap, points, mask, T, frame, params.map, params.knn, neighbours)
+    width = params.knn.least_width * params.map.voxel_size
+    return associate(pmap, points, mask, T, frame, params.map, params.knn, neighbours, width)
 
 
 @jax.jit
@@ -75,7 +76,7 @@ def columns(points: np.ndarray) -> list[jax.Array]:
 def test_planes_are_those_of_the_singular_value_decomposition(noise):
     points, _ = five(400, noise, seed=0)
     points = points.astype(np.float32).astype(float)
-    fitted, offset, farthest = _fit(*columns(points))
+    fitted, offset, farthest, _ = _fit(*columns(points))
     mean = points.mean(1)
     values, vectors = np.linalg.svd(points - mean[:, None])[1:]
     expected = vectors[:, 2]
@@ -98,7 +99,7 @@ def test_a_plane_through_the_origin_is_a_plane_like_any_other():
     """The equation m'p = -1 has no solution there."""
     points, normal = five(100, 0.0, seed=1)
     points -= points.mean(1, keepdims=True)
-    fitted, _, farthest = _fit(*columns(points))
+    fitted, _, farthest, _ = _fit(*columns(points))
     along = np.abs(np.einsum("ki,ki->k", np.asarray(fitted), normal))
     assert np.quantile(along, 0.05) > 0.9999
     assert np.asarray(farthest).max() < 1e-4
@@ -126,7 +127,7 @@ def scan() -> tuple[jax.Array, jax.Array]:
     return jnp.asarray(points, jnp.float32), jnp.asarray(np.arange(667) % 10 > 0)
 
 
-def matches_by_hand(points, held_points, radius, tolerance):
+def matches_by_hand(points, held_points, radius, tolerance, least_width):
     """Return normal, centre and validity for each world point, one by one in double precision."""
     tree = cKDTree(held_points)
     normals, centres, valid, margins = [], [], [], []
@@ -134,12 +135,13 @@ def matches_by_hand(points, held_points, radius, tolerance):
         distance, index = tree.query(point, 5)
         near = held_points[index]
         centre = near.mean(0)
-        normal = np.linalg.svd(near - centre)[2][2]
+        _, sizes, axes = np.linalg.svd(near - centre)
+        normal, width = axes[2], sizes[1] / np.sqrt(5)
         worst = np.abs((near - centre) @ normal).max()
         normals.append(normal)
         centres.append(centre)
-        valid.append(distance[-1] < radius and worst <= tolerance)
-        margins.append(min(abs(worst - tolerance), 1.5 - distance[-1]))
+        valid.append(distance[-1] < radius and worst <= tolerance and width >= least_width)
+        margins.append(min(abs(worst - tolerance), 1.5 - distance[-1], abs(width - least_width)))
     return np.array(normals), np.array(centres), np.array(valid), np.array(margins)
 
 
@@ -148,15 +150,14 @@ def world_of(points) -> np.ndarray:
     return np.asarray(points, float) @ pose[:3, :3].T + pose[:3, 3]
 
 
-@pytest.mark.parametrize("tolerance", [0.02, 0.1])
-def test_matches_are_those_of_a_k_d_tree_and_a_decomposition(scene, scan, tolerance):
+@pytest.mark.parametrize(("tolerance", "width"), [(0.02, 0.4), (0.1, 0.0), (0.1, 0.6)])
+def test_matches_are_those_of_a_k_d_tree_and_a_decomposition(scene, scan, tolerance, width):
     pmap, held_points = scene
     points, mask = scan
-    planes = _associate(
-        pmap, points, mask, POSE, FRAME, params_with(f"params.knn.plane_tolerance={tolerance}"), 5
-    )
-    world = world_of(points)
-    normals, centres, valid, margin = matches_by_hand(world, held_points, 5**0.5, tolerance)
+    params = params_with(f"params.knn.plane_tolerance={tolerance}", f"params.knn.least_width={width}")
+    planes = _associate(pmap, points, mask, POSE, FRAME, params, 5)
+    world, least_width = world_of(points), width * float(params.map.voxel_size)
+    normals, centres, valid, margin = matches_by_hand(world, held_points, 5**0.5, tolerance, least_width)
     # within a block's edge the search is complete, and at the tolerance rounding decides
     certain = margin > 1e-3
     assert certain.mean() > 0.7
@@ -168,6 +169,27 @@ def test_matches_are_those_of_a_k_d_tree_and_a_decomposition(scene, scan, tolera
     expected = np.einsum("ki,ki->k", normals, world - centres)
     off = np.abs(np.abs(distance) - np.abs(expected))[chosen]
     assert np.quantile(off, 0.98) < 1e-3
+
+
+def test_the_ring_of_a_sensor_on_the_ground_defines_no_plane():
+    rng = np.random.default_rng(5)
+    angles = np.arange(0, 2 * np.pi, 0.06)
+    ring = 10 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1) + rng.normal(
+        0, 0.02, (len(angles), 3)
+    )
+    origin = jnp.zeros(3, jnp.int32)
+    half, size = jnp.float32(100), PARAMS.map.voxel_size.astype(jnp.float32)
+    every = jnp.ones(len(ring), bool)
+    placed = jnp.asarray(ring, jnp.float32)
+    pmap, _ = jax.jit(insert)(empty_map(4096), placed, every, origin, size, half, jnp.float32(0))
+    frame = Frame(origin, jnp.zeros(3))
+    at_origin = jaxlie.SE3.identity()
+    found = [
+        np.asarray(_associate(pmap, placed, every, at_origin, frame, params_with(width), 5).valid).mean()
+        for width in ("params.knn.least_width=0", "params.knn.least_width=0.4")
+    ]
+    assert found[0] > 0.8
+    assert found[1] < 0.02
 
 
 def test_neighbours_beyond_the_radius_make_no_match(scene, scan):
