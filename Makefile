@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test test-all test-long lint bench settings clean
+.PHONY: demo test test-all test-long lint bench fuzz settings clean
 
 demo: $(VENV)/.installed
 	$(BIN)/lio-jax demo --out out/demo --overwrite
@@ -29,6 +29,12 @@ lint: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-bench
 	$(BIN)/python experiments/bench/lidar_vs_peers.py
+
+# Damaged files through the command line: N of them, the same ones for the same SEED. Failures stay in out/fuzz/kept.
+N ?= 1000
+SEED ?= 0
+fuzz: $(VENV)/.installed-dev
+	$(BIN)/python -m experiments.fuzz --inputs $(N) --seed $(SEED)
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

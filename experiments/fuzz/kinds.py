@@ -1,0 +1,165 @@
+"""The kinds of input: which files are damaged, in which ways, and the command that reads them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+
+from experiments.fuzz import mutations
+from experiments.fuzz.edits import Edit
+from experiments.fuzz.mutations import Draw
+
+_NATIVE = ("export", "{in}/drive", "--to", "native", "--out", "{out}/r")
+_KITTI = ("export", "{in}/04", "--to", "native", "--out", "{out}/r")
+_TEXT = (mutations.text,) * 6 + (mutations.raw, mutations.whole)
+_NPZ = (mutations.array,) * 6 + (mutations.raw, mutations.raw, mutations.whole)
+_TREE = (mutations.tree,) * 8 + (mutations.raw, mutations.whole)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of input."""
+
+    name: str
+    seed: str
+    """Folder of the seeds from which an input starts."""
+    files: tuple[str, ...]
+    """Patterns of the files that are damaged."""
+    draws: tuple[Draw, ...]
+    """Ways of damage; one is drawn for each edit."""
+    commands: tuple[tuple[str, ...], ...]
+    """Words of the commands, of which one is drawn; {in} is the input's folder, {out} the one for results."""
+    ends: str = ""
+    """Regular expression of a refusal that means: this file was accepted, and what comes after it is not there.
+
+    For files whose content would start work that takes minutes: the command is given a recording that does
+    not exist.
+    """
+    may_be_nan: tuple[str, ...] = ()
+    """Names of results in which a value that is not finite is right."""
+
+    def draw(self, folder: Path, random: Random) -> list[Edit]:
+        """Return one to three edits of a seed's folder."""
+        files = sorted({path for pattern in self.files for path in folder.glob(pattern)})
+        edits: list[Edit] = []
+        for _ in range(random.choice((1, 1, 1, 2, 2, 3))):
+            file = random.choice(files)
+            edits.append(random.choice(self.draws)(folder, str(file.relative_to(folder)), random))
+        return edits
+
+
+def _bag(name: str, seed: str, file: str, layout: str) -> Kind:
+    draws = (mutations.number(layout),) * 8 + (mutations.raw, mutations.raw)
+    data = f"{{in}}/{file}"
+    commands = (("export", data, "--to", "native", "--out", "{out}/r"), ("inspect", data, "--json"))
+    return Kind(
+        name,
+        seed,
+        (file,),
+        (*draws, mutations.whole) if name == seed else draws,
+        (commands[0],) * 4 + (commands[1],),
+    )
+
+
+_NOWHERE = r"nowhere: no such file or folder"
+
+KINDS = (
+    _bag("ros1", "ros1", "a.bag", "ros1"),
+    _bag("messages", "ros1", "a.bag", "messages"),
+    _bag("livox", "livox", "a.bag", "messages"),
+    _bag("ouster", "ouster", "a.bag", "messages"),
+    _bag("mcap", "mcap", "a.mcap", "mcap"),
+    _bag("sqlite", "sqlite", "a.db3", "sqlite"),
+    Kind("npz", "native", ("drive/**/*.npz",), _NPZ, (_NATIVE,) * 3 + (("inspect", "{in}/drive", "--json"),)),
+    Kind(
+        "imu.npz",
+        "native",
+        ("drive/imu.npz",),
+        _NPZ,
+        (("calibrate-imu", "{in}/drive/imu.npz", "--out", "{out}/r.yaml"), _NATIVE),
+    ),
+    Kind("meta.yaml", "native", ("drive/meta.yaml",), _TREE, (_NATIVE,)),
+    Kind(
+        "truth.tum",
+        "native",
+        ("drive/truth.tum",),
+        _TEXT,
+        (_NATIVE, ("eval", "{in}/drive/truth.tum", "{in}/drive")),
+    ),
+    Kind("kitti", "kitti", ("04/*.txt",), _TEXT, (_KITTI, ("eval", "{in}/04/poses.txt", "{in}/04"))),
+    Kind("kitti scans", "kitti", ("04/velodyne/*",), (mutations.raw, mutations.whole), (_KITTI,)),
+    Kind(
+        "kitti raw",
+        "kitti_raw",
+        ("day/*.txt", "day/drive/*/*.txt", "day/drive/*/data/*"),
+        _TEXT,
+        (("export", "{in}/day/drive", "--to", "native", "--out", "{out}/r"),),
+    ),
+    Kind(
+        "tum",
+        "poses",
+        ("estimate.tum",),
+        _TEXT,
+        (
+            ("eval", "{in}/estimate.tum", "{in}/reference.tum"),
+            ("eval", "{in}/reference.tum", "{in}/estimate.tum", "--json"),
+        ),
+    ),
+    Kind(
+        "kitti poses",
+        "poses",
+        ("estimate.txt", "times.txt"),
+        _TEXT,
+        (
+            ("eval", "{in}/estimate.txt", "{in}/reference.txt"),
+            ("eval", "{in}/reference.txt", "{in}/estimate.txt", "--json"),
+        ),
+    ),
+    Kind(
+        "g2o",
+        "graph",
+        ("*.g2o",),
+        _TEXT,
+        (
+            ("optimize-graph", "{in}/in.g2o", "{out}/r.g2o"),
+            ("optimize-graph", "{in}/plane.g2o", "{out}/r.g2o", "--json"),
+        ),
+    ),
+    Kind(
+        "settings",
+        "settings",
+        ("my.yaml",),
+        _TREE,
+        (("run", "{in}/nowhere", "--recipe", "{in}/my.yaml", "--out", "{out}/r"),),
+        _NOWHERE,
+    ),
+    Kind(
+        "foreign",
+        "foreign",
+        ("*.yaml",),
+        _TREE,
+        tuple(
+            ("run", "{in}/nowhere", "--params-from", f"{{in}}/{name}.yaml", "--out", "{out}/r")
+            for name in ("lio_sam", "fast_lio")
+        ),
+        _NOWHERE,
+    ),
+    Kind(
+        "spec",
+        "spec",
+        ("spec.yaml",),
+        _TREE,
+        (("ablate", "{in}/spec.yaml", "--out", "{out}/taken"),),
+        r"taken: is a file",
+    ),
+    Kind(
+        "map", "run", ("run/map.pcd", "run/keyframes/*"), _NPZ, (("map", "{in}/run", "--out", "{out}/r.pcd"),)
+    ),
+    Kind(
+        "report",
+        "run",
+        ("run/*.npz", "run/*.json", "run/*.tum", "run/config.yaml"),
+        (mutations.raw, mutations.whole),
+        (("report", "{in}/run", "--out", "{out}/r.html"),),
+    ),
+)
+"""All kinds of input."""
