@@ -40,7 +40,8 @@ class Worker:
     def run(self, words: list[str], allowed: Path) -> Done:
         """Run one command, which may write to the folder ``allowed`` only."""
         process = self._started()
-        assert process.stdin is not None and process.stdout is not None
+        assert process.stdin is not None
+        assert process.stdout is not None
         files = {name: self._work / f"worker.{name}" for name in ("out", "err")}
         before = resident_bytes(process.pid)
         for path in files.values():

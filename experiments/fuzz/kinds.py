@@ -29,7 +29,8 @@ class Kind:
     commands: tuple[tuple[str, ...], ...]
     """Words of the commands, of which one is drawn; {in} is the input's folder, {out} the one for results."""
     ends: str = ""
-    """Regular expression of a refusal that means: this file was accepted, and what comes after it is not there.
+    """Regular expression of a refusal that means that this file was accepted.
+
 
     For files whose content would start work that takes minutes: the command is given a recording that does
     not exist.

@@ -1,4 +1,4 @@
-"""Small healthy inputs that the campaign damages: recordings in every format, poses, graphs, settings, a run."""
+"""Small healthy inputs for the campaign: recordings in every format, poses, graphs, settings, a run."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,7 @@
 """A process that runs commands of ``lio-jax`` one after another, and reports what each one did.
 
-It keeps the package imported, so that a command takes milliseconds. A job is a line of JSON on standard input,
-its report a line of JSON on standard output; the command's own output goes to the job's files.
+It keeps the package imported, so that a command takes milliseconds. A job is a line of JSON on standard input
+and its report one on standard output; the command's own output goes to the job's files.
 """
 
 import json

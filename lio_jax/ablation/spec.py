@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import yaml
-
 from lio_jax.ablation.sources import RECORDED_KEYS, SIMULATED_KEYS, Source, recorded, simulated
 from lio_jax.ablation.variants import KINDS, Overrides, Variant, overrides_of, variants
 from lio_jax.core.errors import UsageError
+from lio_jax.core.files import parse_yaml, read_text
 from lio_jax.evaluation.kitti_segments import SegmentErrors
 from lio_jax.evaluation.trajectory_error import PoseError
 
@@ -84,12 +83,12 @@ def load_spec(path: Path) -> Spec:
             sentence names file and key, and the nearest valid key.
     """
     try:
-        text = path.read_text()
-        tree = yaml.safe_load(text)
+        text = read_text(path, "give a YAML specification", UsageError)
+        tree = parse_yaml(text)
     except OSError as error:
         raise UsageError(f"{path}: the specification cannot be read ({error.strerror}).") from None
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UsageError(f"{path}: not valid YAML ({' '.join(str(error).split())}).") from None
+    except ValueError as error:
+        raise UsageError(f"{path}: not valid YAML ({error}).") from None
     place = str(path)
     if not isinstance(tree, dict):
         raise UsageError(f"{place}: must hold sequences and one of {', '.join(KINDS)}, not {tree!r}.")
@@ -160,7 +159,7 @@ def _metrics(tree: dict[str, Any], place: str) -> tuple[str, ...]:
     if not isinstance(metrics, list) or not metrics:
         raise UsageError(f"{place}: metrics = {metrics!r} must be a list such as [ate.rmse].")
     for metric in metrics:
-        if metric not in METRICS:
+        if not isinstance(metric, str) or metric not in METRICS:
             raise UsageError(f"{place}: metrics: unknown metric '{metric}'; {_nearest(str(metric), METRICS)}")
     return tuple(metrics)
 

@@ -102,6 +102,10 @@ def _from_npz(path: Path) -> ImuData:
         arrays = read_arrays(path)
     except (OSError, ValueError):
         raise LioJaxError(f"{path}: cannot be read as an .npz file; give a native imu.npz.") from None
+    if strange := [key for key in arrays if arrays[key].dtype.kind not in "fiu"]:
+        raise LioJaxError(
+            f"{path}: {strange[0]} holds {arrays[strange[0]].dtype}, no numbers; give a native imu.npz."
+        )
     if "gyro_dps" in arrays:
         arrays["gyro"] = np.radians(arrays["gyro_dps"].astype(np.float64))
     if "accel_g" in arrays:
@@ -111,6 +115,8 @@ def _from_npz(path: Path) -> ImuData:
         arrays.setdefault("stamp_ns", np.round(np.arange(count) * (1e9 / float(arrays["rate_hz"]))))
     if missing := [key for key in ("stamp_ns", "gyro", "accel") if key not in arrays]:
         raise LioJaxError(f"{path}: holds no {', '.join(missing)}; give a native imu.npz.")
+    if not np.isfinite(arrays["stamp_ns"]).all():
+        raise LioJaxError(f"{path}: stamp_ns is not finite; give a native imu.npz.")
     stamps = arrays["stamp_ns"].astype(np.int64)
     gyro, accel = (np.asarray(arrays[key], np.float64) for key in ("gyro", "accel"))
     if stamps.ndim != 1 or gyro.shape != (len(stamps), 3) or accel.shape != (len(stamps), 3):

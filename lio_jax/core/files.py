@@ -1,4 +1,4 @@
-"""Read .npz files safely; write files atomically: under a temporary name in the same folder, then renamed."""
+"""Read text, YAML and .npz files safely; write files atomically: under a temporary name, then renamed."""
 
 import fcntl
 import os
@@ -14,11 +14,63 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
+
+from lio_jax.core.errors import LioJaxError
 
 _TOKEN_BYTES = 4
 _DAMAGES = (KeyError, EOFError, MemoryError, RuntimeError, struct.error, zipfile.BadZipFile, zlib.error)
 """What a damaged .npz file may raise in addition to ValueError."""
+_MOST_NODES = 100_000
+"""Largest number of values in a YAML text, with aliases written out: a few lines can stand for billions."""
+
+
+def read_text(path: Path, remedy: str, error: type[LioJaxError] = LioJaxError) -> str:
+    """Return the text of a file in UTF-8, without the byte order mark that some editors put before it.
+
+    Args:
+        path: path of the file.
+        remedy: what to do if it is no text, the end of a sentence without its point.
+        error: class of the error.
+
+    Raises:
+        OSError: the file can't be opened or read.
+        LioJaxError: the file is not in UTF-8; it is of the class ``error``.
+    """
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise error(f"{path}: is not a text file; {remedy}.") from None
+
+
+def parse_yaml(text: str) -> Any:
+    """Return the value that a YAML text holds.
+
+    Raises:
+        ValueError: it is not YAML, or its aliases stand for too many values; the message is one line.
+    """
+    try:
+        tree = yaml.safe_load(text)
+        if _nodes(tree, {}) > _MOST_NODES:
+            raise ValueError("it holds too many values")
+        return tree
+    except RecursionError:
+        raise ValueError("it is nested too deeply, or within itself") from None
+    except yaml.YAMLError as error:
+        raise ValueError(" ".join(str(error).split())) from None
+    # yaml reads tagged values such as !!timestamp 9 by functions that raise exceptions of many kinds
+    except Exception as error:
+        raise ValueError(f"a value cannot be read: {' '.join(str(error).split())}") from None
+
+
+def _nodes(node: Any, known: dict[int, int]) -> int:
+    """Return the number of values in a tree, counting what an alias repeats each time."""
+    if id(node) not in known:
+        children = [*node, *node.values()] if isinstance(node, dict) else node
+        children = children if isinstance(node, dict | list) else ()
+        known[id(node)] = 1 + sum(_nodes(child, known) for child in children)
+    return known[id(node)]
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -37,7 +89,34 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             with file:
                 return {name: file[name] for name in file.files}
         except _DAMAGES as error:
-            raise ValueError(str(error) or type(error).__name__) from None
+            raise ValueError(str(error) or "it is damaged") from None
+
+
+def array_of(
+    arrays: dict[str, NDArray[Any]], name: str, shape: tuple[int | None, ...], kinds: str = "fiu"
+) -> NDArray[Any]:
+    """Return one array of a file if it is of the form that its reader expects.
+
+    Args:
+        arrays: all arrays of the file.
+        name: name of the wanted one.
+        shape: wanted size along each axis; None: any size.
+        kinds: accepted kinds of number, as in ``dtype.kind``.
+
+    Raises:
+        ValueError: it is missing, or has another shape or another type.
+    """
+    if name not in arrays:
+        raise ValueError(f"it lacks {name}")
+    array = arrays[name]
+    fits = len(array.shape) == len(shape) and all(
+        wanted in (None, size) for wanted, size in zip(shape, array.shape, strict=True)
+    )
+    if not fits or array.dtype.kind not in kinds:
+        numbers = "whole numbers" if kinds == "iu" else "numbers"
+        sizes = ", ".join("n" if size is None else str(size) for size in shape)
+        raise ValueError(f"{name} is an array {array.shape} of {array.dtype}, not ({sizes}) of {numbers}")
+    return array
 
 
 @contextmanager

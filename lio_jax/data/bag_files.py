@@ -209,7 +209,7 @@ def until_damage(messages: Iterator[Any], report: Callable[[str], None]) -> Iter
             return
         # As on opening: rosbags, sqlite, lz4 and zstd raise exceptions of different kinds on damaged data.
         except Exception as error:
-            report(_reason(error))
+            report(why(error))
             return
         yield message
 
@@ -242,7 +242,7 @@ def _why_unreadable(paths: Sequence[Path], error: Exception) -> str:
             with Reader1(path) if path.suffix == ".bag" else Reader2(path):
                 pass
         except Exception as alone:
-            reason = _reason(alone)
+            reason = why(alone)
             if "not supported" in reason or "nsupported" in reason:
                 return (
                     f"{path}: this kind of bag cannot be read ({reason}); convert it with 'rosbags-convert'."
@@ -250,7 +250,7 @@ def _why_unreadable(paths: Sequence[Path], error: Exception) -> str:
             if "missing" in reason and "files" in reason:
                 return f"{path}: the bag folder is incomplete ({reason}); copy the missing files into it."
             return _unfinished(path, reason)
-    return f"{paths[0]}: its message definitions cannot be understood ({_reason(error)}); remove that topic."
+    return f"{paths[0]}: its message definitions cannot be understood ({why(error)}); remove that topic."
 
 
 def _unfinished(path: Path, reason: str) -> str:
@@ -265,6 +265,15 @@ def _unfinished(path: Path, reason: str) -> str:
     )
 
 
-def _reason(error: Exception) -> str:
+_LONGEST_REASON = 200
+
+
+def why(error: Exception) -> str:
+    """Return in a few words why rosbags or a library below it gave up; it ends without a point."""
+    if isinstance(error, MemoryError | OverflowError):
+        return "a damaged length asks for more memory than there is"
     text = " ".join(str(error).split()).rstrip(".")
-    return text or f"unexpected {type(error).__name__}"
+    # a missing key's message is the bare key
+    if not text or isinstance(error, KeyError | AssertionError):
+        return "its records contradict each other"
+    return text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]} ..."

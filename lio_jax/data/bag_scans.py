@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.timestamps import ns_to_seconds
 from lio_jax.data import pointcloud2
-from lio_jax.data.bag_files import Topic
+from lio_jax.data.bag_files import Topic, why
 from lio_jax.data.config import DataConfig
 from lio_jax.data.point_time import PointTiming, TimeSample, recognise_point_time, scan_period, stamp_end
 from lio_jax.data.pointcloud2 import RawCloud, decode_pointcloud2
@@ -36,7 +36,7 @@ def decode_cloud(reader: "AnyReader", topic: Topic, raw: bytes, time_field: str,
         message: Any = reader.deserialize(raw, topic.type)
     # The generated decoders raise struct, index, unicode or their own errors on damaged bytes.
     except Exception as error:
-        raise ValueError(f"the message cannot be decoded: {error}") from error
+        raise ValueError(f"the message cannot be decoded: {why(error)}") from error
     return decode_pointcloud2(message, time_field=time_field, where=where)
 
 

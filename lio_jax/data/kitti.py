@@ -11,18 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.core.timestamps import seconds_to_ns
+from lio_jax.core.files import read_text
+from lio_jax.core.timestamps import FARTHEST_NS, seconds_to_ns
 from lio_jax.data.config import DataConfig
 from lio_jax.data.reconstruct import KITTI_START_AZIMUTH, azimuth_time
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
 from lio_jax.data.time_order import Stamped, ascending, in_time_order
-from lio_jax.data.trajectory import Trajectory, read_kitti_poses
+from lio_jax.data.trajectory import Trajectory, are_rigid, read_kitti_poses
 from lio_jax.data.velodyne_file import (
     check_sizes,
     elevation_note,
     hdl64_ring,
     listed,
-    missing_numbers,
+    listed_runs,
+    missing_runs,
     numbered_files,
     raise_elevation,
     read_returns,
@@ -93,10 +95,15 @@ class KittiSequence:
         if self._poses_path is None or self._T_cam_lidar is None:
             return None
         poses = read_kitti_poses(self._poses_path)
-        # a pose with a wrong time is not used
-        kept = ascending(self._stamps[: len(poses)])
+        # a pose that is not finite or has a wrong time is not used
+        numbers = [number for number in range(len(poses)) if number in self._stamps]
+        numbers = [number for number in numbers if np.isfinite(poses[number]).all()]
+        kept = [numbers[place] for place in ascending([self._stamps[number] for number in numbers])]
+        if not kept:
+            return None
         lidar = poses[kept] @ self._T_cam_lidar
-        return Trajectory(np.array(self._stamps, np.int64)[kept], np.linalg.inv(lidar[0]) @ lidar)
+        stamps = np.array([self._stamps[number] for number in kept], np.int64)
+        return Trajectory(stamps, np.linalg.inv(lidar[0]) @ lidar)
 
     def _scan(self, stamp_ns: int, rows: NDArray[np.float32]) -> LidarScan:
         points = np.ascontiguousarray(rows[:, :3])
@@ -110,32 +117,26 @@ class KittiSequence:
             duration=duration,
         )
 
-    def _read_stamps(self, files: dict[int, Path]) -> list[int]:
+    def _read_stamps(self, files: dict[int, Path]) -> dict[int, int]:
+        """Return the stamps by the scan's number, ns."""
         path = self._path / "times.txt"
         if not path.is_file():
             period_ns = round(self._config.scan_period * 1e9)
             self._notes.append(f"no times.txt: scans are taken to be {self._config.scan_period} s apart")
-            return [number * period_ns for number in range(max(files) + 1)]
-        stamps = []
-        for number, line in enumerate(path.read_text().split(), 1):
-            try:
-                stamps.append(seconds_to_ns(line))
-            except (ValueError, OverflowError):
-                raise LioJaxError(
-                    f"{path}: entry {number} ('{line[:40]}') is not a time in seconds; fix it."
-                ) from None
+            return {number: number * period_ns for number in files if number * period_ns < FARTHEST_NS}
+        stamps = read_times(path)
         last = max(files)
         if len(stamps) > last + 1:
             self._notes.append(
                 f"a cut-out: times.txt has {len(stamps)} entries, the scans end at {last:06d}.bin"
             )
-        return stamps
+        return dict(enumerate(stamps))
 
     def _usable(self, files: dict[int, Path]) -> list[tuple[int, Path]]:
         velodyne = self._path / "velodyne"
-        if missing := missing_numbers(files):
-            self._log.add(f"{velodyne}: scan(s) {listed(missing, 6)} are missing and were skipped.")
-        if untimed := [number for number in files if number >= len(self._stamps)]:
+        if missing := missing_runs(files):
+            self._log.add(f"{velodyne}: scan(s) {listed_runs(missing, 6)} are missing and were skipped.")
+        if untimed := [number for number in files if number not in self._stamps]:
             self._log.add(
                 f"{self._path / 'times.txt'}: ends before scan(s) {listed(untimed, 6)}; they were skipped."
             )
@@ -143,7 +144,7 @@ class KittiSequence:
         timed = (
             Stamped(self._stamps[number], str(path), (number, path))
             for number, path in files.items()
-            if number < len(self._stamps)
+            if number in self._stamps
         )
         return list(in_time_order(timed, self._log.add))
 
@@ -164,7 +165,7 @@ class KittiSequence:
                     "no calib.txt: the camera's poses cannot be turned into the lidar's, no truth"
                 )
             return None
-        for line in path.read_text().splitlines():
+        for line in read_text(path, "give the calib.txt of the sequence").splitlines():
             key, _, values = line.partition(":")
             if key.strip() in ("Tr", "Tr_velo_to_cam"):
                 try:
@@ -173,9 +174,30 @@ class KittiSequence:
                     raise LioJaxError(
                         f"{path}: '{key.strip()}' does not hold 12 numbers (3x4); fix it."
                     ) from None
+                if not are_rigid(rows[None]).all():
+                    raise LioJaxError(
+                        f"{path}: '{key.strip()}' is no rotation with a translation (3x4); fix it."
+                    )
                 return np.vstack([rows, [0.0, 0.0, 0.0, 1.0]])
         self._notes.append("calib.txt has no entry Tr (lidar to camera): no truth")
         return None
+
+
+def read_times(path: Path) -> list[int]:
+    """Read the stamps of a times.txt, ns.
+
+    Raises:
+        LioJaxError: an entry is not a time in seconds.
+    """
+    stamps = []
+    for number, word in enumerate(read_text(path, "give the times.txt of the sequence").split(), 1):
+        try:
+            stamps.append(seconds_to_ns(word))
+        except ValueError:
+            raise LioJaxError(
+                f"{path}: entry {number} ('{word[:40]}') is not a time in seconds; fix it."
+            ) from None
+    return stamps
 
 
 def pose_files(path: Path) -> list[Path]:

@@ -10,18 +10,20 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import LioJaxError
+from lio_jax.core.files import read_text
 from lio_jax.data.config import DataConfig
 from lio_jax.data.enu import geodetic_to_enu, mercator_positions
 from lio_jax.data.reconstruct import KITTI_START_AZIMUTH, azimuth_time
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
 from lio_jax.data.time_order import Stamped, ascending, in_time_order
-from lio_jax.data.trajectory import Trajectory
+from lio_jax.data.trajectory import Trajectory, are_rigid
 from lio_jax.data.velodyne_file import (
     check_sizes,
     elevation_note,
     hdl64_ring,
     listed,
-    missing_numbers,
+    listed_runs,
+    missing_runs,
     numbered_files,
     raise_elevation,
     read_returns,
@@ -82,7 +84,7 @@ def read_timestamps(path: Path) -> NDArray[np.int64]:
     """
     if not path.is_file():
         raise LioJaxError(f"{path}: missing; copy the drive's folder completely.")
-    lines = path.read_text().rstrip().splitlines()
+    lines = read_text(path, "copy it again from the drive").rstrip().splitlines()
     try:
         stamps = np.array([line.strip() for line in lines], "datetime64[ns]")
     except ValueError:
@@ -127,7 +129,7 @@ def read_oxts(folder: Path, warn: Callable[[str], None]) -> OxtsPackets | None:
 
 def _packet(path: Path) -> NDArray[np.float64] | None:
     try:
-        values = np.array(path.read_text().split(), float)
+        values = np.array(path.read_text(encoding="utf-8").split(), float)
     except (OSError, ValueError):
         return None
     return values if values.size == _FIELDS and np.isfinite(values).all() else None
@@ -241,8 +243,10 @@ class KittiRawSequence:
         last = max(files)
         if len(starts) > last + 1:
             self._notes.append(f"a cut-out: {len(starts)} timestamps, the scans end at {files[last].name}")
-        if missing := missing_numbers(files):
-            self._log.add(f"{velodyne / 'data'}: scan(s) {listed(missing, 10)} are missing and were skipped.")
+        if missing := missing_runs(files):
+            self._log.add(
+                f"{velodyne / 'data'}: scan(s) {listed_runs(missing, 10)} are missing and were skipped."
+            )
         if unstamped := [n for n in files if n < len(starts) and not _has_stamp(starts, n)]:
             self._log.add(
                 f"{velodyne}: the timestamps of scan(s) {listed(unstamped, 10)} are empty; they were skipped."
@@ -295,14 +299,17 @@ class KittiRawSequence:
         if not path.is_file():
             self._notes.append("no calib_imu_to_velo.txt in the parent folder: the extrinsic is unknown")
             return None
-        entries = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
+        lines = read_text(path, "copy it again from the drive").splitlines()
+        entries = dict(line.split(":", 1) for line in lines if ":" in line)
         T_lidar_imu = np.eye(4)
         try:
             T_lidar_imu[:3, :3] = np.array(entries["R"].split(), float).reshape(3, 3)
             T_lidar_imu[:3, 3] = np.array(entries["T"].split(), float)
-            return np.asarray(np.linalg.inv(T_lidar_imu), np.float64)
-        except (KeyError, ValueError, np.linalg.LinAlgError):
+        except (KeyError, ValueError):
             raise LioJaxError(f"{path}: needs the entries R (9 numbers) and T (3 numbers); fix it.") from None
+        if not are_rigid(T_lidar_imu[None]).all():
+            raise LioJaxError(f"{path}: R is no rotation, or T is not finite; fix it.")
+        return np.asarray(np.linalg.inv(T_lidar_imu), np.float64)
 
 
 READER = Reader(

@@ -6,18 +6,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.core.files import read_arrays
+from lio_jax.core.files import array_of, parse_yaml, read_arrays, read_text
 from lio_jax.data.config import DataConfig
 from lio_jax.data.pointcloud2 import valid_returns
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
 from lio_jax.data.time_order import Stamped, in_time_order
-from lio_jax.data.trajectory import Trajectory, read_tum
-from lio_jax.data.velodyne_file import listed, missing_numbers, numbered_files
+from lio_jax.data.trajectory import Trajectory, are_rigid, read_tum
+from lio_jax.data.velodyne_file import listed_runs, missing_runs, numbered_files
 
+_LONGEST_S = 3600.0
+"""Durations of a scan from here on are damage, s."""
 FORMAT_VERSION = 1
 """Format version that is written to meta.yaml, and the only one that is read."""
 
@@ -40,8 +41,10 @@ class NativeSequence:
             raise LioJaxError(
                 f"{path / 'scans'}: holds no scans (NNNNNN.npz); give a complete native folder."
             )
-        if missing := missing_numbers(files):
-            self._log.add(f"{path / 'scans'}: scan(s) {listed(missing, 6)} are missing and were skipped.")
+        if missing := missing_runs(files):
+            self._log.add(
+                f"{path / 'scans'}: scan(s) {listed_runs(missing, 6)} are missing and were skipped."
+            )
         self._files = list(files.values())
 
     @property
@@ -73,14 +76,15 @@ class NativeSequence:
 
     def imu(self) -> ImuData | None:
         """Return the samples of imu.npz, or None where there is no such file."""
-        arrays = self._arrays("imu.npz", ("stamp_ns", "gyro", "accel"))
+        arrays = self._arrays("imu.npz", {"stamp_ns": (), "gyro": (3,), "accel": (3,)}, {"orientation": (4,)})
         if arrays is None:
             return None
         return ImuData(arrays["stamp_ns"], arrays["gyro"], arrays["accel"], arrays.get("orientation"))
 
     def gps(self) -> GpsData | None:
         """Return the fixes of gps.npz, or None where there is no such file."""
-        arrays = self._arrays("gps.npz", ("stamp_ns", "position", "covariance", "origin"))
+        forms = {"stamp_ns": (), "position": (3,), "covariance": (3, 3)}
+        arrays = self._arrays("gps.npz", forms, single={"origin": (3,)})
         if arrays is None:
             return None
         latitude, longitude, altitude = (float(value) for value in arrays["origin"])
@@ -94,7 +98,7 @@ class NativeSequence:
 
     def truth_arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of truth.npz (true noise, biases); empty where there is no such file."""
-        return self._arrays("truth.npz", ()) or {}
+        return self._arrays("truth.npz", {}) or {}
 
     @cached_property
     def _truth(self) -> Trajectory | None:
@@ -108,44 +112,73 @@ class NativeSequence:
             self._log.add(f"{path}: cannot be read ({error}), the scan was skipped.")
             return None
 
-    def _arrays(self, name: str, required: tuple[str, ...]) -> dict[str, NDArray[Any]] | None:
+    def _arrays(
+        self,
+        name: str,
+        columns: dict[str, tuple[int, ...]],
+        optional: dict[str, tuple[int, ...]] | None = None,
+        single: dict[str, tuple[int, ...]] | None = None,
+    ) -> dict[str, NDArray[Any]] | None:
+        """Return the arrays of a file; None where there is none.
+
+        Args:
+            name: name of the file.
+            columns: arrays of one length that it must hold, and the shape of each entry.
+            optional: the same for arrays that it may hold.
+            single: other arrays that it must hold, and their shapes.
+        """
         path = self._path / name
         if not path.is_file():
             return None
+        single = single or {}
         try:
             arrays = read_arrays(path)
+            if missing := [key for key in (*columns, *single) if key not in arrays]:
+                raise LioJaxError(f"{path}: lacks {', '.join(missing)}; write the folder again.")
+            for key, shape in single.items():
+                array_of(arrays, key, shape)
+            there = {key: shape for key, shape in (optional or {}).items() if key in arrays}
+            count: int | None = None
+            for key, shape in (columns | there).items():
+                kinds = "iu" if key == "stamp_ns" else "fiu"
+                count = len(array_of(arrays, key, (count, *shape), kinds))
+                arrays[key] = arrays[key].astype(np.int64 if kinds == "iu" else np.float64, copy=False)
         except (OSError, ValueError) as error:
             raise LioJaxError(f"{path}: cannot be read ({error}); write the folder again.") from None
-        if missing := [key for key in required if key not in arrays]:
-            raise LioJaxError(f"{path}: lacks {', '.join(missing)}; write the folder again.")
         return arrays
 
 
 def _scan_of(arrays: dict[str, NDArray[Any]], compensated: bool) -> LidarScan:
-    points = arrays["points"].astype(np.float32, copy=False)
+    points = array_of(arrays, "points", (None, 3), "f")
     count = len(points)
-    time, ring, intensity = arrays["time"], arrays["ring"], arrays["intensity"]
-    if points.shape != (count, 3) or not len(time) == len(ring) == len(intensity) == count:
+    if any(arrays[name].shape[:1] != (count,) for name in ("time", "ring", "intensity")):
         raise ValueError("points, time, ring and intensity differ in length")
-    duration = float(arrays.get("duration", time.max() if count else 0.0))
+    time, intensity = (array_of(arrays, name, (count,)) for name in ("time", "intensity"))
+    ring = array_of(arrays, "ring", (count,), "iu")
+    duration = float(array_of(arrays, "duration", ()) if "duration" in arrays else time.max(initial=0.0))
+    if not (np.isfinite(time).all() and 0.0 <= duration < _LONGEST_S):
+        raise ValueError(f"a point's time is not finite, or the duration ({duration} s) is impossible")
+    with np.errstate(over="ignore"):
+        points = points.astype(np.float32, copy=False)
+        intensity = intensity.astype(np.float32, copy=False)
     valid = valid_returns(points)
     if not valid.all():
         points, time, ring, intensity = points[valid], time[valid], ring[valid], intensity[valid]
     return LidarScan(
-        stamp_ns=int(arrays["stamp_ns"]),
+        stamp_ns=int(array_of(arrays, "stamp_ns", (), "iu")),
         points=points,
         time=np.zeros(len(points), np.float32) if compensated else time.astype(np.float32, copy=False),
         ring=ring.astype(np.int32, copy=False),
-        intensity=intensity.astype(np.float32, copy=False),
+        intensity=intensity,
         duration=0.0 if compensated else duration,
     )
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
     try:
-        meta = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise LioJaxError(f"{path}: cannot be read as YAML ({str(error).splitlines()[0]}); fix it.") from None
+        meta = parse_yaml(read_text(path, "give the meta.yaml of the folder"))
+    except (OSError, ValueError) as error:
+        raise LioJaxError(f"{path}: cannot be read as YAML ({error}); fix it.") from None
     if not isinstance(meta, dict) or meta.get("format_version") != FORMAT_VERSION:
         found = meta.get("format_version") if isinstance(meta, dict) else None
         raise LioJaxError(f"{path}: format_version is {found}, this program reads {FORMAT_VERSION}.")
@@ -155,6 +188,8 @@ def _read_meta(path: Path) -> dict[str, Any]:
             extrinsic = np.array(extrinsic, float).reshape(4, 4)
         except (TypeError, ValueError):
             raise LioJaxError(f"{path}: T_imu_lidar is not four rows of four numbers; fix it.") from None
+        if not are_rigid(extrinsic[None]).all():
+            raise LioJaxError(f"{path}: T_imu_lidar is no rotation with a translation; fix it.")
     return {
         "T_imu_lidar": extrinsic,
         "sensor": str(meta.get("sensor") or ""),

@@ -22,6 +22,7 @@ from lio_jax.data.bag_files import (
     read_frame,
     read_header,
     until_damage,
+    why,
 )
 from lio_jax.data.bag_scans import decode_cloud, recognise_scans
 from lio_jax.data.config import DataConfig
@@ -208,7 +209,7 @@ class RosbagSequence:
             T_imu_lidar = transform_between(gathered(decoded), imu, lidar)
         # The generated decoders raise exceptions of many kinds on damaged bytes.
         except Exception as error:
-            broken(str(error))
+            broken(why(error))
             return None
         if T_imu_lidar is None:
             self._notes.append(f"T_imu_lidar: {static_transforms.TOPIC} does not tie {lidar} to {imu}")
@@ -269,6 +270,9 @@ class RosbagSequence:
                 take[self._gps_topic.name] = lambda raw: gps.add(reader.deserialize(raw, gps_type))
             unreadable = dict.fromkeys(take, 0)
             for connection, _, raw in until_damage(self._messages(reader, *topics), broken):
+                # a damaged record may belong to a topic that was not asked for
+                if connection.topic not in take:
+                    continue
                 try:
                     take[connection.topic](raw)
                 # The generated decoders raise exceptions of many kinds on damaged bytes.

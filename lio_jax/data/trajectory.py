@@ -1,5 +1,6 @@
 """Time-stamped poses on the host, and the two text formats in which the field exchanges them."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from lio_jax.core.errors import LioJaxError
+from lio_jax.core.files import read_text
 from lio_jax.core.timestamps import ns_to_seconds, seconds_to_ns
 
 
@@ -68,6 +70,23 @@ def pose_matrices(positions: NDArray[np.float64], quaternions: NDArray[np.float6
     return poses
 
 
+_ROTATION_ERROR = 0.01
+"""Largest error of R R^T of a rotation in a file, where few decimals may be written."""
+_QUATERNION_LENGTHS = (0.1, 10.0)
+"""Lengths of quaternions that are normalised; another one is no rotation."""
+
+
+def are_rigid(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return whether each (3, 4) or (4, 4) matrix is finite and a rotation with a translation, (n,)."""
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    rotations = np.where(finite[:, None, None], matrices[:, :3, :3], 0.0)
+    # an entry of a rotation is at most one; the square of a larger one may overflow
+    small = (np.abs(rotations) < 2).all(axis=(1, 2))
+    rotations[~small] = 0.0
+    error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    return np.asarray((error < _ROTATION_ERROR) & (np.linalg.det(rotations) > 0))
+
+
 def read_tum(path: Path) -> Trajectory:
     """Read lines ``t x y z qx qy qz qw`` (s, m, xyzw).
 
@@ -75,7 +94,8 @@ def read_tum(path: Path) -> Trajectory:
         LioJaxError: a line does not hold eight numbers, or time does not ascend.
     """
     stamps, rows = [], []
-    for number, line in enumerate(path.read_text().splitlines(), 1):
+    lines = read_text(path, "give a TUM file, lines of 't x y z qx qy qz qw'").splitlines()
+    for number, line in enumerate(lines, 1):
         words = line.replace(",", " ").split("#")[0].split()
         if not words:
             continue
@@ -84,7 +104,9 @@ def read_tum(path: Path) -> Trajectory:
                 raise ValueError
             stamps.append(seconds_to_ns(words[0]))
             rows.append([float(word) for word in words[1:]])
-            if not any(rows[-1][3:]):
+            length = math.hypot(*rows[-1][3:])
+            # a pose of NaN is an estimate that failed
+            if length < _QUATERNION_LENGTHS[0] or _QUATERNION_LENGTHS[1] < length < math.inf:
                 raise ValueError
         except (ValueError, OverflowError):
             raise LioJaxError(
@@ -118,11 +140,17 @@ def tum_lines(trajectory: Trajectory) -> str:
 def read_kitti_poses(path: Path) -> NDArray[np.float64]:
     """Read (n, 4, 4) poses from lines of twelve numbers (3x4, row major).
 
+    Poses with NaN or infinity are returned as they are: estimates that failed.
+
     Raises:
-        LioJaxError: a line does not hold twelve numbers.
+        LioJaxError: a line does not hold twelve numbers, or its 3x3 part is no rotation.
     """
+    text = read_text(path, "give a KITTI pose file, lines of 12 numbers")
+    lines = [line for line in text.splitlines() if line.split("#")[0].strip()]
+    if not lines:
+        raise LioJaxError(f"{path}: holds no poses; a KITTI pose file has one line of 12 numbers each.")
     try:
-        rows = np.loadtxt(path, ndmin=2)
+        rows = np.loadtxt(lines, ndmin=2)
     except ValueError as error:
         raise LioJaxError(f"{path}: not a KITTI pose file ({error}); each line holds 12 numbers.") from None
     if rows.shape[1] != 12:
@@ -131,6 +159,12 @@ def read_kitti_poses(path: Path) -> NDArray[np.float64]:
         )
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :] = rows.reshape(-1, 3, 4)
+    wrong = np.isfinite(rows).all(axis=1) & ~are_rigid(poses)
+    if wrong.any():
+        raise LioJaxError(
+            f"{path}: pose {int(np.argmax(wrong)) + 1} is no rotation with a translation (the rows of its "
+            "3x3 part must be orthogonal and of length 1); fix or remove its line."
+        )
     return poses
 
 

@@ -1,6 +1,7 @@
 """Point files of KITTI, binary float32 or text rows ``x y z intensity``; broken files are handled."""
 
 from collections.abc import Callable, Iterable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,26 +18,37 @@ _HDL64_BEAMS = 64
 def numbered_files(folder: Path, suffixes: Iterable[str]) -> dict[int, Path]:
     """Return the files whose names are numbers, by number, ascending."""
     wanted = set(suffixes)
-    found = {
-        int(path.stem): path for path in folder.iterdir() if path.suffix in wanted and path.stem.isdigit()
-    }
+    found = {int(path.stem): path for path in folder.iterdir() if path.suffix in wanted and _is_number(path)}
     return dict(sorted(found.items()))
 
 
-def missing_numbers(files: dict[int, Path]) -> list[int]:
+def _is_number(path: Path) -> bool:
+    # other alphabets' digits are decimal, too, and superscripts are digits that int() refuses
+    return path.stem.isascii() and path.stem.isdecimal()
+
+
+Runs = list[tuple[int, int]]
+"""First and last number of each run of successive numbers: a wrong file name may leave a gap of billions."""
+
+
+def missing_runs(files: dict[int, Path]) -> Runs:
     """Return the numbers that are absent between the first and the last."""
-    numbers = list(files)
-    return sorted(set(range(numbers[0], numbers[-1])) - set(numbers)) if numbers else []
+    return [(before + 1, after - 1) for before, after in pairwise(files) if after > before + 1]
 
 
 def listed(numbers: list[int], digits: int) -> str:
     """Write scan numbers as runs: ``000003, 000007-000012``."""
-    runs: list[list[int]] = []
+    runs: Runs = []
     for number in numbers:
         if runs and number == runs[-1][1] + 1:
-            runs[-1][1] = number
+            runs[-1] = (runs[-1][0], number)
         else:
-            runs.append([number, number])
+            runs.append((number, number))
+    return listed_runs(runs, digits)
+
+
+def listed_runs(runs: Runs, digits: int) -> str:
+    """Write runs of scan numbers: ``000003, 000007-000012``."""
     return ", ".join(
         f"{first:0{digits}d}" if first == last else f"{first:0{digits}d}-{last:0{digits}d}"
         for first, last in runs
@@ -120,7 +132,7 @@ def _check_size(path: Path, size: int, warn: Callable[[str], None]) -> None:
 
 
 def _read_text(path: Path, warn: Callable[[str], None]) -> NDArray[np.float32]:
-    lines = path.read_text().split("\n")
+    lines = path.read_text(encoding="utf-8").split("\n")
     while lines and not lines[-1].strip():
         lines.pop()
     if not lines:

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.core.timestamps import seconds_to_ns
+from lio_jax.core.files import read_text
+from lio_jax.data.kitti import read_times
 from lio_jax.data.trajectory import Trajectory, read_kitti_poses, read_tum
 
 _RUN_TRAJECTORY = "trajectory.tum"
@@ -42,16 +43,11 @@ def load_trajectory(path: Path) -> LoadedTrajectory:
         path = path / _RUN_TRAJECTORY
     if path.is_dir() or path.suffix in _bag_suffixes():
         return _recorded_truth(path)
-    try:
-        columns = _columns(path)
-        if columns == 8:
-            return LoadedTrajectory(read_tum(path), True, str(path))
-        if columns == 12:
-            return _kitti(path)
-    except UnicodeDecodeError:
-        raise LioJaxError(f"{path}: is not a text file; give a TUM or KITTI pose file.") from None
-    except (ValueError, OverflowError) as error:
-        raise LioJaxError(f"{path}: not a trajectory ({error}); give a TUM or KITTI pose file.") from None
+    columns = _columns(path)
+    if columns == 8:
+        return LoadedTrajectory(read_tum(path), True, str(path))
+    if columns == 12:
+        return _kitti(path)
     raise LioJaxError(
         f"{path}: {columns} numbers in its first line; a TUM trajectory has 8 (t x y z qx qy qz qw), "
         "a KITTI pose file 12."
@@ -59,11 +55,10 @@ def load_trajectory(path: Path) -> LoadedTrajectory:
 
 
 def _columns(path: Path) -> int:
-    with path.open() as lines:
-        for line in lines:
-            words = line.replace(",", " ").split("#")[0].split()
-            if words:
-                return len(words)
+    for line in read_text(path, "give a TUM or KITTI pose file").splitlines():
+        words = line.replace(",", " ").split("#")[0].split()
+        if words:
+            return len(words)
     raise LioJaxError(f"{path}: holds no poses; the run that should have written it has probably failed.")
 
 
@@ -83,7 +78,7 @@ def _kitti_stamps(path: Path, count: int) -> NDArray[np.int64] | None:
             return stamps
     for times in (path.with_name("times.txt"), path.parent.parent / "sequences" / path.stem / "times.txt"):
         if times.is_file():
-            stamps = np.array([seconds_to_ns(word) for word in times.read_text().split()], np.int64)
+            stamps = np.array(read_times(times), np.int64)
             if len(stamps) == count and np.all(np.diff(stamps) > 0):
                 return stamps
     return None

@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import LioJaxError, UsageError
+from lio_jax.core.files import read_text
 from lio_jax.core.timestamps import seconds_to_ns
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.loops.place_descriptor import DescribedPlaces, Likeness
@@ -126,13 +127,9 @@ def read_pairs(path: Path) -> list[Pair]:
         LioJaxError: a line has another form; the message names it.
     """
     try:
-        text = path.read_text()
+        text = read_text(path, "give lines of 'time_a time_b [x y z qx qy qz qw]'")
     except OSError as error:
         raise UsageError(f"{path}: the pairs of times cannot be read ({error.strerror}).") from None
-    except UnicodeDecodeError:
-        raise LioJaxError(
-            f"{path}: not a text file; give lines of 'time_a time_b [x y z qx qy qz qw]'."
-        ) from None
     pairs = []
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split("#")[0].replace(",", " ").split()
@@ -166,7 +163,10 @@ def _pair(words: list[str], number: int, place: str) -> Pair:
         raise LioJaxError(f"{place}: '{' '.join(words)}' are not all numbers.") from None
     if not all(math.isfinite(value) for value in values):
         raise LioJaxError(f"{place}: '{' '.join(words)}' are not all finite.")
-    a, b = seconds_to_ns(words[0]), seconds_to_ns(words[1])
+    try:
+        a, b = seconds_to_ns(words[0]), seconds_to_ns(words[1])
+    except ValueError as error:
+        raise LioJaxError(f"{place}: {error}.") from None
     if a == b:
         raise LioJaxError(f"{place}: both times are {words[0]}; a loop needs two.")
     T_a_b = _pose(values[2:], place) if len(values) > 2 else None

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.core.files import atomic_path
+from lio_jax.core.files import atomic_path, read_text
 from lio_jax.pose_graph.graph import LOOP, ODOMETRY, PRIOR, PoseGraph, Poses, numbers_of
 from lio_jax.pose_graph.structure import parts_of
 
@@ -150,10 +150,7 @@ def read_g2o(path: Path) -> G2oFile:
     Raises:
         LioJaxError: the file cannot be read as a pose graph; the message names the line.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise LioJaxError(f"{path}: not a text file; a g2o file holds lines such as {SPACE.edge}.") from error
+    lines = read_text(path, f"a g2o file holds lines such as {SPACE.edge}").splitlines()
     numbers: dict[str, list[int]] = {}
     for number, line in enumerate(lines):
         words = line.split(None, 1)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.core.files import atomic_path, read_arrays
+from lio_jax.core.files import array_of, atomic_path, read_arrays
 from lio_jax.core.geometry import carried
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.pose_graph.g2o import G2oEdge
@@ -203,7 +203,7 @@ class StoredKeyframes:
         path = self.folder / _name(number)
         arrays = _arrays(path)
         points, corner = arrays.get("points"), arrays.get("corner")
-        if points is None or points.ndim != 2 or points.shape[1] != 3:
+        if points is None or points.dtype.kind != "f" or points.ndim != 2 or points.shape[1] != 3:
             raise LioJaxError(f"{path}: holds no points (n, 3); run again.")
         if part == "whole":
             return points.astype(np.float32, copy=False)
@@ -237,7 +237,13 @@ def read_keyframes(run_folder: Path) -> StoredKeyframes:
     if missing := [name for name in names if name not in arrays]:
         raise LioJaxError(f"{path}: lacks {', '.join(missing)}; run again.")
     stamps_ns, T_world_imu, T_odom_imu = (arrays[name] for name in names)
-    if not (T_world_imu.shape == T_odom_imu.shape == (len(stamps_ns), 4, 4)):
+    try:
+        count = len(array_of(arrays, "stamps_ns", (None,), "iu"))
+        for name in ("T_world_imu", "T_odom_imu"):
+            array_of(arrays, name, (None, 4, 4), "f")
+    except ValueError as error:
+        raise LioJaxError(f"{path}: cannot be read ({error}); run again.") from None
+    if not len(T_world_imu) == len(T_odom_imu) == count:
         raise LioJaxError(f"{path}: its stamps and poses differ in number; run again.")
     return StoredKeyframes(folder, stamps_ns, T_world_imu, T_odom_imu)
 

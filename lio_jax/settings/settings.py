@@ -20,6 +20,7 @@ import numpy as np
 import yaml
 
 from lio_jax.core.errors import UsageError
+from lio_jax.core.files import parse_yaml, read_text
 from lio_jax.core.leaf import Declared, Setting, choices, numbers_of, settings_of, traced
 from lio_jax.recipes import RECIPES, AnyRecipe, full_name, recipe_named
 from lio_jax.recipes.params import RecipeConfig, RecipeParams
@@ -181,15 +182,17 @@ def settings_from_yaml(text: str, source: str, base: Settings | None = None) -> 
         UsageError: not YAML, an unknown key or an impossible value; the message names file and key.
     """
     try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        reason = " ".join(str(error).split())
-        raise UsageError(f"{source}: not valid YAML ({reason}).") from None
+        tree = parse_yaml(text)
+    except ValueError as error:
+        raise UsageError(f"{source}: not valid YAML ({error}).") from None
     if tree is None:
         return base or Settings()
     if not isinstance(tree, dict):
         raise UsageError(f"{source}: expected keys 'recipe', 'config' and 'params', found {tree!r}.")
-    settings = base or recipe_settings(str(tree.get("recipe", Settings.recipe)))
+    try:
+        settings = base or recipe_settings(str(tree.get("recipe", Settings.recipe)))
+    except UsageError as error:
+        raise UsageError(f"{source}: {error}") from None
     for path, value in _leaves(tree, source):
         settings = settings.with_value(path, value, source)
     return checked_together(settings, source)
@@ -198,11 +201,9 @@ def settings_from_yaml(text: str, source: str, base: Settings | None = None) -> 
 def load_settings(path: Path, base: Settings | None = None) -> Settings:
     """Read a settings file; see :func:`settings_from_yaml`."""
     try:
-        text = path.read_text()
+        text = read_text(path, "give a YAML settings file", UsageError)
     except OSError as error:
         raise UsageError(f"{path}: the settings file cannot be read ({error.strerror}).") from None
-    except UnicodeDecodeError:
-        raise UsageError(f"{path}: is not a text file; give a YAML settings file.") from None
     return settings_from_yaml(text, str(path), base)
 
 
@@ -221,8 +222,8 @@ def with_overrides(settings: Settings, assignments: list[str] | tuple[str, ...])
         if path.strip() == "recipe":
             raise UsageError("--set recipe: choose the recipe by --recipe, because it brings its own values.")
         try:
-            parsed = yaml.safe_load(value)
-        except yaml.YAMLError:
+            parsed = parse_yaml(value)
+        except ValueError:
             raise UsageError(f"--set {path}: the value {value!r} is not valid YAML.") from None
         settings = settings.with_value(path.strip(), parsed, "--set")
     return checked_together(settings, "--set") if assignments else settings

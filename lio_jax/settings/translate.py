@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from lio_jax.core.errors import UsageError
+from lio_jax.core.files import parse_yaml, read_text
 from lio_jax.settings.foreign_rules import Rule, System
 from lio_jax.settings.from_fast_lio2 import FAST_LIO2
 from lio_jax.settings.from_lio_sam import LIO_SAM
@@ -79,11 +78,9 @@ def load_foreign_settings(path: Path) -> ForeignSettings:
             the message names file and key.
     """
     try:
-        text = path.read_text()
+        text = read_text(path, "give a YAML parameter file", UsageError)
     except OSError as error:
         raise UsageError(f"{path}: the parameter file cannot be read ({error.strerror}).") from None
-    except UnicodeDecodeError:
-        raise UsageError(f"{path}: is not a text file; give a YAML parameter file.") from None
     return foreign_settings_from_yaml(text, str(path))
 
 
@@ -139,9 +136,9 @@ def _parsed(text: str, source: str) -> Any:
             f"matrices as plain lists in a parameter file of {_NAMES}."
         )
     try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise UsageError(f"{source}: not valid YAML ({' '.join(str(error).split())}).") from None
+        return parse_yaml(text)
+    except ValueError as error:
+        raise UsageError(f"{source}: not valid YAML ({error}).") from None
 
 
 def _parameters(tree: Any, source: str) -> tuple[dict[str, Any], str]:

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.core.files import read_arrays
+from lio_jax.core.files import array_of, parse_yaml, read_arrays, read_text
 from lio_jax.data.trajectory import Trajectory, read_tum
 from lio_jax.evaluation.association import MatchedTrajectories, match_by_time
 from lio_jax.evaluation.trajectory_error import Alignment, align
@@ -54,7 +53,7 @@ def read_correction(folder: Path) -> CorrectionRecord | None:
         return None
     path = folder / "loops.json"
     try:
-        loops = json.loads(path.read_text())["loops"]
+        loops = json.loads(read_text(path, "run again"))["loops"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise LioJaxError(f"{path}: cannot be read ({error}); run again.") from None
     keyframes = read_keyframes(folder).T_world_imu[:, :3, 3]
@@ -155,23 +154,38 @@ def read_run(folder: Path) -> RunRecord:
         raise LioJaxError(f"{folder}: {missing[0]} is not there; give a folder that lio-jax run wrote.")
     reading = folder / "metrics.json"
     try:
-        metrics = json.loads(reading.read_text())
+        metrics = json.loads(read_text(reading, "run again"))
+        if not isinstance(metrics, dict):
+            raise ValueError("it holds no object")
         reading = folder / "config.yaml"
-        text = reading.read_text()
-        config = yaml.safe_load(text)
+        text = read_text(reading, "run again")
+        config = parse_yaml(text)
+        if not isinstance(config, dict):
+            raise ValueError("it holds no settings")
         reading = folder / "states.npz"
-        states = read_arrays(reading)
-        if "poses" not in states or not len(states["poses"]):
-            raise ValueError("it holds no poses")
+        states = _states(read_arrays(reading))
         reading = folder / "scans.npz"
         scans = read_arrays(reading) if reading.is_file() else {}
-    except (OSError, ValueError, yaml.YAMLError) as error:
+        for name in scans:
+            array_of(scans, name, (len(states["poses"]),) + (None,) * (scans[name].ndim - 1), "fiub")
+    except (OSError, ValueError) as error:
         raise LioJaxError(f"{reading}: cannot be read ({error}); run again.") from None
     remarks: list[str] = []
     run = RunRecord(
         folder, metrics, text, config, states, scans, remarks=remarks, correction=read_correction(folder)
     )
     return replace(run, comparison=_compared(folder / "truth.tum", run.trajectory, remarks))
+
+
+def _states(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
+    """Return the columns of states.npz, checked: one row for each pose."""
+    if "poses" not in arrays or not arrays["poses"].size:
+        raise ValueError("it holds no poses")
+    count = len(array_of(arrays, "poses", (None, 4, 4), "f"))
+    array_of(arrays, "stamps_ns", (count,), "iu")
+    for name in arrays:
+        array_of(arrays, name, (count,) + (None,) * (arrays[name].ndim - 1), "fiub")
+    return arrays
 
 
 def _compared(path: Path, estimate: Trajectory, remarks: list[str]) -> TruthComparison | None:
