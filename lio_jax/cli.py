@@ -16,7 +16,7 @@ from tyro.conf import Positional, arg
 
 from lio_jax.commands.runtime import ended_like_ctrl_c, usage_in_a_sentence
 from lio_jax.commands.sim_options import ErrorOptions, Format, MotionOptions, SensorOptions
-from lio_jax.core.errors import LioJaxError, UsageError
+from lio_jax.core.errors import LioJaxError, UsageError, one_line
 from lio_jax.tuning.objective_names import EXAMPLE, LISTED
 
 Assignments = Annotated[
@@ -407,7 +407,7 @@ _DESCRIPTION = (
 
 def _sentence(error: BaseException) -> str:
     if isinstance(error, LioJaxError):
-        return str(error)
+        return one_line(str(error))
     if isinstance(error, KeyboardInterrupt):
         return "interrupted before the job was done."
     if isinstance(error, OSError) and error.filename and error.strerror:

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from itertools import count, islice
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -27,6 +28,8 @@ MOST_BYTES = 2 << 30
 SILENCE_S = 20.0
 """Time after which a command that has printed nothing further counts as hanging, s."""
 _LOOK_S = 0.02
+_MOST_KEPT = 4 << 30
+"""Memory of a worker after which it is replaced before its next command, bytes."""
 _START_S = 120.0
 
 
@@ -40,12 +43,17 @@ class Worker:
     def run(self, words: list[str], allowed: Path) -> Done:
         """Run one command, which may write to the folder ``allowed`` only."""
         process = self._started()
-        assert process.stdin is not None
-        assert process.stdout is not None
         files = {name: self._work / f"worker.{name}" for name in ("out", "err")}
         before = resident_bytes(process.pid)
+        if before > _MOST_KEPT:
+            # compiled programs pile up
+            self.close()
+            process = self._started()
+            before = 0
         for path in files.values():
             path.write_bytes(b"")
+        assert process.stdin is not None
+        assert process.stdout is not None
         job = {"words": words, "allowed": str(allowed), **{name: str(path) for name, path in files.items()}}
         try:
             process.stdin.write(json.dumps(job) + "\n")
@@ -279,10 +287,10 @@ def run_campaign(
     campaign = Campaign({kind.name: Counter() for kind in chosen})
     begin = time.monotonic()
     with _trial(work, any(kind.seed == "run" for kind in chosen)) as trial:
-        for number in range(inputs):
-            kind = chosen[number % len(chosen)]
+        for number, kind in enumerate(islice(_in_turn(chosen), inputs)):
             random = Random(f"{seed} {kind.name} {number}")
-            edits, words = trial.edits(kind, random), random.choice(kind.commands)
+            edits = trial.edits(kind, random)
+            words = kind.words(edits, random)
             verdict = trial.verdict(kind, words, edits)
             campaign.verdicts[kind.name].update(["inputs", verdict.name])
             if verdict.failed:
@@ -291,6 +299,11 @@ def run_campaign(
                 print(f"{number + 1} inputs, {time.monotonic() - begin:.0f} s", flush=True)
     campaign.seconds = time.monotonic() - begin
     return campaign
+
+
+def _in_turn(kinds: list[Kind]) -> Iterator[Kind]:
+    for turn in count():
+        yield from (kind for kind in kinds if turn % kind.every == 0)
 
 
 def _note(

@@ -1,5 +1,6 @@
 """Edits of files. An edit is plain data, so that a failing input is kept as a few lines of JSON."""
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -106,7 +107,8 @@ def _array(path: Path, name: str, action: str) -> None:
 def _filled(value: float) -> Callable[[np.ndarray], np.ndarray]:
     def fill(array: np.ndarray) -> np.ndarray:
         array = array.astype(np.float64) if array.dtype.kind in "biu" else np.array(array)
-        array.reshape(-1)[::7] = value
+        with np.errstate(over="ignore"):
+            array.reshape(-1)[::7] = value
         return array
 
     return fill
@@ -128,7 +130,6 @@ ARRAY_ACTIONS: dict[str, Callable[[np.ndarray], np.ndarray | None]] = {
     "complex": lambda array: array.astype(complex),
     "bool": lambda array: array.astype(bool),
     "small": lambda array: array.astype(np.int8),
-    "half": lambda array: array.astype(np.float16),
     "unsigned": lambda array: array.astype(np.uint64),
     "dates": lambda array: np.zeros(array.shape, "datetime64[ns]"),
     "named": lambda array: np.zeros(array.shape, [("x", float)]),
@@ -143,10 +144,15 @@ ARRAY_ACTIONS: dict[str, Callable[[np.ndarray], np.ndarray | None]] = {
 }
 """Changes of an array, by name; one that gives None removes it."""
 
+VALUE_ACTIONS = ("nan", "inf", "huge", "tiny", "far", "negative", "zero", "backwards")
+"""Those that keep the array's shape and the kind of its numbers."""
+
 
 def _tree(path: Path, keys: list[Any], action: str, value: Any = None) -> None:
-    """Change one node of a YAML or JSON file (JSON is YAML): replace it, or remove, rename or wrap it."""
-    tree = yaml.safe_load(path.read_text())
+    """Change one node of a YAML or JSON file: replace it, or remove, rename or wrap it."""
+    text = path.read_text()
+    is_json = path.suffix == ".json"
+    tree = json.loads(text) if is_json else yaml.safe_load(text)
     parent = tree
     for key in keys[:-1]:
         parent = parent[key]
@@ -160,7 +166,7 @@ def _tree(path: Path, keys: list[Any], action: str, value: Any = None) -> None:
         parent[value] = parent.pop(keys[-1])
     elif action == "wrap":
         parent[keys[-1]] = [parent[keys[-1]]]
-    path.write_text(yaml.safe_dump(tree, sort_keys=False))
+    path.write_text(json.dumps(tree) if is_json else yaml.safe_dump(tree, sort_keys=False))
 
 
 CHANGES: dict[str, Callable[..., None]] = {

@@ -10,9 +10,14 @@ from experiments.fuzz.mutations import Draw
 
 _NATIVE = ("export", "{in}/drive", "--to", "native", "--out", "{out}/r")
 _KITTI = ("export", "{in}/04", "--to", "native", "--out", "{out}/r")
+_PLAIN = ("config.output.recording=false", "config.output.plot=false", "config.output.report=false")
+_RUN = ("run", "{in}/drive", "--scans", "3", "--out", "{out}/r", "--set", *_PLAIN)
 _TEXT = (mutations.text,) * 6 + (mutations.raw, mutations.whole)
 _NPZ = (mutations.array,) * 6 + (mutations.raw, mutations.raw, mutations.whole)
 _TREE = (mutations.tree,) * 8 + (mutations.raw, mutations.whole)
+_ANY = (mutations.fitting,) * 6 + (mutations.raw, mutations.whole)
+_COPIED = ("gyro", "accel", "orientation", "position", "covariance", "origin", "intensity")
+"""Arrays of a recording that an export copies as they are; a run leaves out what is not finite."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +36,19 @@ class Kind:
     ends: str = ""
     """Regular expression of a refusal that means that this file was accepted.
 
-
     For files whose content would start work that takes minutes: the command is given a recording that does
-    not exist.
+    not exist, or a file where results are to go.
     """
     may_be_nan: tuple[str, ...] = ()
     """Names of results in which a value that is not finite is right."""
+    every: int = 1
+    """The kind takes part in every so manieth round: its commands take longer than others."""
+
+    def words(self, edits: list[Edit], random: Random) -> tuple[str, ...]:
+        """Return the words of a command that reads a damaged file, where only some commands read it."""
+        names = {edit.file.rpartition("/")[2] for edit in edits}
+        reading = [words for words in self.commands if any(name in " ".join(words) for name in names)]
+        return random.choice(reading or self.commands)
 
     def draw(self, folder: Path, random: Random) -> list[Edit]:
         """Return one to three edits of a seed's folder."""
@@ -58,6 +70,7 @@ def _bag(name: str, seed: str, file: str, layout: str) -> Kind:
         (file,),
         (*draws, mutations.whole) if name == seed else draws,
         (commands[0],) * 4 + (commands[1],),
+        may_be_nan=_COPIED,
     )
 
 
@@ -70,13 +83,30 @@ KINDS = (
     _bag("ouster", "ouster", "a.bag", "messages"),
     _bag("mcap", "mcap", "a.mcap", "mcap"),
     _bag("sqlite", "sqlite", "a.db3", "sqlite"),
-    Kind("npz", "native", ("drive/**/*.npz",), _NPZ, (_NATIVE,) * 3 + (("inspect", "{in}/drive", "--json"),)),
     Kind(
-        "imu.npz",
+        "npz",
         "native",
-        ("drive/imu.npz",),
+        ("drive/**/*.npz",),
         _NPZ,
-        (("calibrate-imu", "{in}/drive/imu.npz", "--out", "{out}/r.yaml"), _NATIVE),
+        (_NATIVE,) * 3 + (("inspect", "{in}/drive", "--json"),),
+        may_be_nan=_COPIED,
+    ),
+    Kind("run", "native", ("drive/**/*.npz",), (mutations.sound_array,), (_RUN,), every=5),
+    Kind(
+        "run settings",
+        "native",
+        ("my.yaml",),
+        (mutations.tree,),
+        ((*_RUN, "--recipe", "{in}/my.yaml"),),
+        every=50,
+    ),
+    Kind(
+        "rest",
+        "rest",
+        ("imu.npz",),
+        (*_NPZ, mutations.sound_array),
+        (("calibrate-imu", "{in}/imu.npz", "--out", "{out}/r.yaml"),),
+        every=2,
     ),
     Kind("meta.yaml", "native", ("drive/meta.yaml",), _TREE, (_NATIVE,)),
     Kind(
@@ -87,13 +117,21 @@ KINDS = (
         (_NATIVE, ("eval", "{in}/drive/truth.tum", "{in}/drive")),
     ),
     Kind("kitti", "kitti", ("04/*.txt",), _TEXT, (_KITTI, ("eval", "{in}/04/poses.txt", "{in}/04"))),
-    Kind("kitti scans", "kitti", ("04/velodyne/*",), (mutations.raw, mutations.whole), (_KITTI,)),
+    Kind(
+        "kitti scans",
+        "kitti",
+        ("04/velodyne/*",),
+        (mutations.raw, mutations.whole),
+        (_KITTI,),
+        may_be_nan=_COPIED,
+    ),
     Kind(
         "kitti raw",
         "kitti_raw",
         ("day/*.txt", "day/drive/*/*.txt", "day/drive/*/data/*"),
         _TEXT,
         (("export", "{in}/day/drive", "--to", "native", "--out", "{out}/r"),),
+        may_be_nan=_COPIED,
     ),
     Kind(
         "tum",
@@ -159,7 +197,7 @@ KINDS = (
         "report",
         "run",
         ("run/*.npz", "run/*.json", "run/*.tum", "run/config.yaml"),
-        (mutations.raw, mutations.whole),
+        _ANY,
         (("report", "{in}/run", "--out", "{out}/r.html"),),
     ),
 )

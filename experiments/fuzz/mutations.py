@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from experiments.fuzz.edits import ARRAY_ACTIONS, Edit
+from experiments.fuzz.edits import ARRAY_ACTIONS, VALUE_ACTIONS, Edit
 from experiments.fuzz.layouts import NUMBERS, Number
 
 Draw = Callable[[Path, str, Random], Edit]
@@ -156,7 +156,7 @@ def array(folder: Path, file: str, random: Random) -> Edit:
 def tree(folder: Path, file: str, random: Random) -> Edit:
     """Change one node of a YAML or JSON file, or put text into it that YAML reads in a strange way."""
     data = (folder / file).read_bytes()
-    if random.random() < 0.25:
+    if random.random() < 0.25 and not file.endswith(".json"):
         begins = [0, *(place + 1 for place, byte in enumerate(data) if byte in b"\n :[")]
         return Edit(file, "insert", (random.choice(begins), random.choice((*_YAML_TEXTS, *_BYTES)).hex()))
     keys = random.choice(_nodes(yaml.safe_load(data)))
@@ -165,6 +165,21 @@ def tree(folder: Path, file: str, random: Random) -> Edit:
         random.choice(_VALUES) if action == "replace" else random.choice((None, 3, "ä", "", True, "a.b.c"))
     )
     return Edit(file, "tree", (keys, action, value))
+
+
+def fitting(folder: Path, file: str, random: Random) -> Edit:
+    """Change a file in the way that its ending suggests."""
+    suffix = Path(file).suffix
+    return {".npz": array, ".yaml": tree, ".json": tree, ".tum": text, ".txt": text}.get(suffix, raw)(
+        folder, file, random
+    )
+
+
+def sound_array(folder: Path, file: str, random: Random) -> Edit:
+    """Change the values of one array of an .npz file, and neither its shape nor its type."""
+    with np.load(folder / file) as held:
+        name = random.choice(held.files)
+    return Edit(file, "array", (name, random.choice(VALUE_ACTIONS)))
 
 
 def _nodes(node: Any, keys: tuple[Any, ...] = ()) -> list[list[Any]]:

@@ -136,6 +136,10 @@ def write_seeds(root: Path, run: Run, with_run: bool) -> None:
     must("export", native, "--to", "kitti", "--out", root / "kitti" / "04")
     _write_kitti_raw(root / "kitti_raw" / "day")
     _write_texts(root)
+    (root / "native" / "my.yaml").write_text(SETTINGS)
+    (root / "rest").mkdir()
+    still = _imu(4000)
+    np.savez(root / "rest" / "imu.npz", stamp_ns=still.stamp_ns, gyro=still.gyro, accel=still.accel)
     if with_run:
         # the back end writes keyframes and a corrected trajectory
         less = ("config.backend.loops=true", "config.output.recording=false", "config.output.plot=false")

@@ -1,5 +1,6 @@
 """Judge what a command did with a damaged file."""
 
+import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +24,8 @@ FAILURES = (
 _LONGEST = 1200
 _EXCEPTION = re.compile(r"\b[A-Z]\w*(Error|Exception|Warning|Exit)\b|object at 0x|unexpected [A-Z]\w+:")
 _NOT_FINITE = re.compile(r"(?<![\w.])[-+]?(nan|inf|infinity)(?![\w.])", re.IGNORECASE)
-_TEXTS = {".tum", ".txt", ".g2o", ".json", ".yaml"}
+_TEXTS = dict.fromkeys((".tum", ".txt", ".g2o"), _NOT_FINITE) | {".yaml": re.compile(r"\.(nan|inf)\b")}
+"""What is not finite, by the ending of a result."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +110,12 @@ def _spoken(line: str) -> bool:
 
 def _not_finite(path: Path, may_be_nan: tuple[str, ...]) -> str:
     """Return where a result holds a value that is not finite; "" where it does not."""
+    if path.suffix == ".json":
+        constants: list[str] = []
+        json.loads(path.read_text(), parse_constant=constants.append)
+        return f"{path.name}: {constants[0]}" if constants else ""
     if path.suffix in _TEXTS and path.is_file():
-        found = _NOT_FINITE.search(path.read_text())
+        found = _TEXTS[path.suffix].search(path.read_text())
         return f"{path.name}: {found[0]}" if found else ""
     if path.suffix == ".npz":
         with np.load(path) as arrays:

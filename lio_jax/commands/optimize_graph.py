@@ -14,6 +14,7 @@ from lio_jax.pose_graph.chordal import chordal_poses
 from lio_jax.pose_graph.g2o import G2oFile, read_g2o, write_graph
 from lio_jax.pose_graph.graduated import Robust
 from lio_jax.pose_graph.graph import LOOP, Solution
+from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError
 from lio_jax.pose_graph.pose_graph import compile_for, solve
 from lio_jax.pose_graph.structure import structure_of
 
@@ -35,15 +36,13 @@ def optimize_graph(source: Path, out: Path, robust: bool, as_json: bool) -> None
     file = read_g2o(source)
     for note in file.notes:
         say(f"note: {source}: {note}")
+    try:
+        solution, file, compile_s, solve_s = _solved(file, robust)
+    except NotPositiveDefiniteError:
+        raise LioJaxError(
+            f"{source}: its equations have no solution; some weight is far too large or too small."
+        ) from None
     graph = file.graph
-    if not file.has_poses:
-        graph = eqx.tree_at(lambda graph: graph.poses, graph, chordal_poses(graph, structure_of(graph)))
-        file = replace(file, graph=graph)
-    begin = time.perf_counter()
-    compile_for(graph)
-    compiled = time.perf_counter()
-    solution = solve(graph, robust=Robust() if robust else None)
-    solve_s = time.perf_counter() - compiled
     if solution.status == "not finite":
         raise LioJaxError(f"{source}: the cost is not a finite number; some edge or weight is far too large.")
     if solution.status != "converged":
@@ -65,8 +64,21 @@ def optimize_graph(source: Path, out: Path, robust: bool, as_json: bool) -> None
     print(f"graph       {len(file.ids)} vertices, {len(graph.i)} edges, {loops} of them loops")
     print(f"cost        {result['initial_cost']:.7g} -> {result['final_cost']:.7g}")
     print(f"iterations  {solution.iterations} ({solution.status})")
-    print(f"time        {solve_s:.3f} s, and {compiled - begin:.3f} s to compile")
+    print(f"time        {solve_s:.3f} s, and {compile_s:.3f} s to compile")
     print(f"written     {out}")
+
+
+def _solved(file: G2oFile, robust: bool) -> tuple[Solution, G2oFile, float, float]:
+    """Return the solution, the graph with its first guess, and the times to compile and to solve, s."""
+    graph = file.graph
+    if not file.has_poses:
+        graph = eqx.tree_at(lambda graph: graph.poses, graph, chordal_poses(graph, structure_of(graph)))
+        file = replace(file, graph=graph)
+    begin = time.perf_counter()
+    compile_for(graph)
+    compiled = time.perf_counter()
+    solution = solve(graph, robust=Robust() if robust else None)
+    return solution, file, compiled - begin, time.perf_counter() - compiled
 
 
 def _distrusted(file: G2oFile, solution: Solution) -> str:

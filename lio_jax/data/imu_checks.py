@@ -71,7 +71,9 @@ def accel_scale(accel: NDArray[np.float64], config: DataConfig) -> tuple[float, 
         return (STANDARD_GRAVITY if config.accel_unit == "g" else 1.0), ""
     if len(accel) == 0:
         return 1.0, ""
-    median = float(np.median(np.linalg.norm(accel, axis=1)))
+    # one damaged sample may be beyond any number's square
+    with np.errstate(over="ignore", invalid="ignore"):
+        median = float(np.median(np.linalg.norm(accel, axis=1)))
     if 0.8 <= median <= 1.25:
         return STANDARD_GRAVITY, f"accelerometer in g (median {median:.3f}): converted to m/s^2"
     if not 7.0 <= median <= 13.0:

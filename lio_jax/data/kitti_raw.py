@@ -1,5 +1,6 @@
 """KITTI raw drives: Velodyne scans, and OXTS packets of one INS that serve as IMU, GPS and ground truth."""
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -85,13 +86,9 @@ def read_timestamps(path: Path) -> NDArray[np.int64]:
     if not path.is_file():
         raise LioJaxError(f"{path}: missing; copy the drive's folder completely.")
     lines = read_text(path, "copy it again from the drive").rstrip().splitlines()
-    try:
-        stamps = np.array([line.strip() for line in lines], "datetime64[ns]")
-    except ValueError:
-        stamps = np.array([], "datetime64[ns]")
-        for number, line in enumerate(lines, 1):
-            _check_timestamp(path, number, line)
-    return stamps.astype(np.int64)
+    for number, line in enumerate(lines, 1):
+        _check_timestamp(path, number, line)
+    return np.array([line.strip() for line in lines], "datetime64[ns]").astype(np.int64)
 
 
 def read_oxts(folder: Path, warn: Callable[[str], None]) -> OxtsPackets | None:
@@ -135,9 +132,16 @@ def _packet(path: Path) -> NDArray[np.float64] | None:
     return values if values.size == _FIELDS and np.isfinite(values).all() else None
 
 
+# numpy reads more than this: time zones, and years that nanoseconds cannot hold, which it wraps around
+_TIMESTAMP = re.compile(r"(19|20)\d\d-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d+)?", re.ASCII)
+
+
 def _check_timestamp(path: Path, number: int, line: str) -> None:
+    word = line.strip()
     try:
-        np.datetime64(line.strip(), "ns")
+        if word and not _TIMESTAMP.fullmatch(word):
+            raise ValueError
+        np.datetime64(word, "ns")
     except ValueError:
         raise LioJaxError(
             f"{path}: line {number} ('{line[:40]}') is not 'YYYY-MM-DD HH:MM:SS.fraction'; fix it."

@@ -74,7 +74,8 @@ class ImuCollector:
     def _orientation(self, quaternions: NDArray[np.float64]) -> NDArray[np.float64] | None:
         if np.frombuffer(self._orientation_covariance, f"{self._order}f8")[0] == -1.0:
             return None
-        norms = np.linalg.norm(quaternions, axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            norms = np.linalg.norm(quaternions, axis=1)
         if not np.all(np.isfinite(norms) & (norms > 0.5)):
             return None
         if np.all(quaternions[:, :3] == 0.0):

@@ -11,7 +11,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.errors import LioJaxError
+from lio_jax.core.errors import LioJaxError, one_line
 from lio_jax.data.config import DataConfig
 from lio_jax.data.trajectory import Trajectory
 
@@ -24,7 +24,7 @@ class WarningLog:
 
     def add(self, sentence: str) -> None:
         """Remember ``sentence`` unless it is known already."""
-        self._sentences[sentence] = None
+        self._sentences[one_line(sentence)] = None
 
     @property
     def sentences(self) -> tuple[str, ...]:

@@ -53,7 +53,7 @@ class RestStart(eqx.Module):
     """Whether the samples are those of a vehicle at rest."""
     accel_scale: Float[Array, ""]
     """Magnitude of the mean specific force over that of gravity: 1 for an ideal accelerometer at rest, 0
-    without samples."""
+    without samples and where all are zero."""
     gyro_scatter: Float[Array, ""]
     """Standard deviation of the angular rate over all axes, rad/s."""
     accel_scatter: Float[Array, ""]
@@ -89,7 +89,9 @@ def initialise_at_rest(
     gyro_scatter, accel_scatter = jnp.mean(scatter, axis=1)
     # at a constant speed in a bend the body's acceleration is the cross product of rate and velocity
     accel = accel - jnp.cross(gyro, initial.velocity)
-    accel = jnp.where(present, accel, jnp.array([0.0, 0.0, 1.0]) * params.gravity)
+    # an accelerometer that is switched off states zero, which has no direction
+    felt = present & jnp.any(accel != 0)
+    accel = jnp.where(felt, accel, jnp.array([0.0, 0.0, 1.0]) * params.gravity)
     strength = jnp.linalg.norm(accel)
     rate = _sample_rate(imu)
     gyro_noise = params.gyro_noise**2 * rate
@@ -131,7 +133,7 @@ def initialise_at_rest(
     return RestStart(
         start=NavEstimate(nav=nav, covariance=covariance),
         is_still=is_still,
-        accel_scale=jnp.where(present, strength / params.gravity, 0.0),
+        accel_scale=jnp.where(felt, strength / params.gravity, 0.0),
         gyro_scatter=jnp.sqrt(gyro_scatter),
         accel_scatter=jnp.sqrt(accel_scatter),
     )

@@ -282,10 +282,15 @@ def _fixed(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the numbers of the vertices that FIX lines name, one or several in a line, and their lines."""
     words = [(word, number) for number in at.tolist() for word in lines[number].split()[1:]]
+    vertices = []
     for word, number in words:
-        if not word.isdecimal():
-            raise LioJaxError(f"{path}: line {number + 1}: '{word}' is not a vertex's number.")
-    return np.array([int(word) for word, _ in words], np.int64), np.array([at for _, at in words], np.int64)
+        try:
+            if not word.isdecimal():
+                raise ValueError
+            vertices.append(np.int64(int(word)))
+        except (ValueError, OverflowError):
+            raise LioJaxError(f"{path}: line {number + 1}: '{word}' is not a vertex's number.") from None
+    return np.array(vertices, np.int64), np.array([at for _, at in words], np.int64)
 
 
 def _identities(count: int, layout: _Layout) -> _Array:

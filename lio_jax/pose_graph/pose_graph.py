@@ -9,6 +9,7 @@ few sizes only, and the order of elimination is found once for each graph.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Literal
 
 import jax
@@ -53,8 +54,8 @@ def solve(
 
     Args:
         graph: vertices and edges.
-        start: "chordal" finds the first guess from the edges. "poses" begins at the graph's own poses, for a
-            graph that was solved before and has grown a little.
+        start: "chordal" finds the first guess from the edges, where their weights allow it. "poses" begins at
+            the graph's own poses, for a graph that was solved before and has grown a little.
         robust: which edges may be wrong; None: all are trusted.
         limits: conditions that end the solve; None: the defaults of :class:`Limits`.
         structure: structure of this graph, if it is known from an earlier solve.
@@ -81,7 +82,9 @@ def _solve(
     own = _point(whole, structure, whole.graph.poses, np.ones(len(structure.i)))
     poses = whole.graph.poses
     if start == "chordal":
-        poses = padded_poses(chordal_poses(graph, structure), len(whole.graph.fixed))
+        # weights of very different size leave no guess; the graph's own poses are one, too
+        with suppress(NotPositiveDefiniteError):
+            poses = padded_poses(chordal_poses(graph, structure), len(whole.graph.fixed))
     if robust is not None:
         descent, weights = graduate(graph, structure, whole, poses, robust, limits)
     else:

@@ -114,6 +114,10 @@ _ROUNDING = 1e-3
 """Largest accepted deviation from an orthonormal matrix: files write as few as three digits."""
 
 
+_LARGEST_ENTRY = 1e6
+"""Beyond this the nearest rotation is not computed: squares may overflow."""
+
+
 def rotation(value: Any, place: str) -> Rotation:
     """Return the rotation given by nine numbers, row by row, or by three rows; the nearest rotation is taken.
 
@@ -123,6 +127,11 @@ def rotation(value: Any, place: str) -> Rotation:
     if isinstance(value, list) and len(value) == 3 and all(isinstance(row, list) for row in value):
         value = [item for row in value for item in row]
     matrix = vector(value, place, 9).reshape(3, 3)
+    if (largest := float(np.abs(matrix).max())) > _LARGEST_ENTRY:
+        raise UsageError(
+            f"{place} is not a rotation: it holds {largest:.4g}, but no number of one is beyond 1; write "
+            "three perpendicular rows of length 1."
+        )
     determinant = float(np.linalg.det(matrix))
     error = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     if error < _ROUNDING and determinant > 0:

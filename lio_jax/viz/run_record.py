@@ -54,10 +54,67 @@ def read_correction(folder: Path) -> CorrectionRecord | None:
     path = folder / "loops.json"
     try:
         loops = json.loads(read_text(path, "run again"))["loops"]
+        if misfit := _misfit(loops, _LOOPS, "loops"):
+            raise ValueError(misfit)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise LioJaxError(f"{path}: cannot be read ({error}); run again.") from None
     keyframes = read_keyframes(folder).T_world_imu[:, :3, 3]
+    if any(not 0 <= loop[end] < len(keyframes) for loop in loops for end in ("source", "target")):
+        raise LioJaxError(f"{path}: names keyframes that {folder / 'keyframes'} does not hold; run again.")
     return CorrectionRecord(read_tum(folder / "trajectory.tum"), keyframes, loops)
+
+
+_NUMBER = (int, float)
+_SEGMENTS = ({"translation_percent": _NUMBER}, None)
+_METRICS = {
+    "recording": {},
+    "prediction": str,
+    "warnings": [str],
+    "notes": [str],
+    "failures": [{"message": str}],
+    "scan_ms": {"total": {"median": _NUMBER, "p95": _NUMBER}},
+    "verdict": {"state": str, "since_s": (*_NUMBER, None), "reasons": [str]},
+    "backend": {
+        "keyframes": _NUMBER,
+        "loops": {"closed": _NUMBER, "distrusted": _NUMBER, "refused": {}},
+        "gps": ({}, None),
+    },
+    "compile_s": _NUMBER,
+    "wall_s": _NUMBER,
+    "peak_rss_mb": _NUMBER,
+    "environment": {},
+    "ate": ({"rmse": (*_NUMBER, None), "max": (*_NUMBER, None)}, None),
+    "kitti": _SEGMENTS,
+    "kitti_short_10_80m": _SEGMENTS,
+}
+"""What a report reads of metrics.json: types, objects with keys, lists of one kind, or alternatives."""
+_COLUMNS = ("scan", "points", "matches", "rmse", "iterations", "unobserved")
+"""Columns of scans.npz that a report reads."""
+_LOOPS = [{"source": int, "target": int, "weight": (*_NUMBER, None)}]
+
+
+def _misfit(value: Any, form: Any, place: str) -> str:
+    """Return what is wrong with a value read from JSON; "" if it has the form.
+
+    Keys of the outermost object may be missing.
+    """
+    if isinstance(form, tuple):
+        problems = [_misfit(value, one, place) for one in form]
+        return "" if "" in problems else problems[0]
+    if isinstance(form, dict):
+        if not isinstance(value, dict):
+            return f"{place or 'the whole'} is no object"
+        missing = [key for key in form if place and key not in value]
+        if missing:
+            return f"{place} lacks {missing[0]}"
+        there = (_misfit(value[key], form[key], f"{place}.{key}".lstrip(".")) for key in form if key in value)
+        return next(filter(None, there), "")
+    if isinstance(form, list):
+        if not isinstance(value, list):
+            return f"{place} is no list"
+        return next(filter(None, (_misfit(one, form[0], f"an entry of {place}") for one in value)), "")
+    fits = value is None if form is None else isinstance(value, form) and not isinstance(value, bool)
+    return "" if fits else f"{place} is {str(value)[:40]!r}"
 
 
 _NEEDED = ("states.npz", "metrics.json", "config.yaml")
@@ -155,8 +212,8 @@ def read_run(folder: Path) -> RunRecord:
     reading = folder / "metrics.json"
     try:
         metrics = json.loads(read_text(reading, "run again"))
-        if not isinstance(metrics, dict):
-            raise ValueError("it holds no object")
+        if misfit := _misfit(metrics, _METRICS, ""):
+            raise ValueError(misfit)
         reading = folder / "config.yaml"
         text = read_text(reading, "run again")
         config = parse_yaml(text)
@@ -166,14 +223,18 @@ def read_run(folder: Path) -> RunRecord:
         states = _states(read_arrays(reading))
         reading = folder / "scans.npz"
         scans = read_arrays(reading) if reading.is_file() else {}
-        for name in scans:
-            array_of(scans, name, (len(states["poses"]),) + (None,) * (scans[name].ndim - 1), "fiub")
+        for name in (*_COLUMNS, *scans) if scans else ():
+            array_of(scans, name, (len(states["poses"]),), "b" if name in ("lost", "failed") else "fiub")
     except (OSError, ValueError) as error:
         raise LioJaxError(f"{reading}: cannot be read ({error}); run again.") from None
     remarks: list[str] = []
-    run = RunRecord(
-        folder, metrics, text, config, states, scans, remarks=remarks, correction=read_correction(folder)
-    )
+    correction = read_correction(folder)
+    if correction and len(correction.trajectory) != len(states["poses"]):
+        raise LioJaxError(
+            f"{folder / 'trajectory.tum'}: holds {len(correction.trajectory)} poses and states.npz "
+            f"{len(states['poses'])}; run again."
+        )
+    run = RunRecord(folder, metrics, text, config, states, scans, remarks=remarks, correction=correction)
     return replace(run, comparison=_compared(folder / "truth.tum", run.trajectory, remarks))
 
 
@@ -183,6 +244,14 @@ def _states(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
         raise ValueError("it holds no poses")
     count = len(array_of(arrays, "poses", (None, 4, 4), "f"))
     array_of(arrays, "stamps_ns", (count,), "iu")
+    for name in ("nis", "nis_dof"):
+        array_of(arrays, name, (count,))
+    array_of(arrays, "velocity", (count, 3))
+    array_of(arrays, "biases", (count, 6))
+    array_of(arrays, "covariance", (count, 6, 6))
+    if "state_covariance" in arrays:
+        size = arrays["state_covariance"].shape[-1:]
+        array_of(arrays, "state_covariance", (count, *size, *size))
     for name in arrays:
         array_of(arrays, name, (count,) + (None,) * (arrays[name].ndim - 1), "fiub")
     return arrays

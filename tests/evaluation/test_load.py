@@ -134,5 +134,5 @@ def test_a_time_that_is_not_finite_is_an_error(tmp_path, time):
         load_trajectory(tmp_path / "a.tum")
     write_kitti_poses(tmp_path / "poses.txt", np.eye(4)[None])
     (tmp_path / "times.txt").write_text(time)
-    with pytest.raises(LioJaxError, match=r"poses\.txt: not a trajectory"):
+    with pytest.raises(LioJaxError, match=rf"times\.txt: entry 1 \('{time}'\) is not a time in seconds"):
         load_trajectory(tmp_path / "poses.txt")
