@@ -92,7 +92,7 @@ def _settings(recipe: str, common: Overrides, overrides: Overrides, folder: Path
         file, colon, _ = chosen.rpartition(":")
         # a recipe in a file is looked for next to the specification first
         beside_spec = bool(colon) and (folder / file).is_file()
-        settings = recipe_settings(str(folder / chosen) if beside_spec else chosen)
+        settings = recipe_settings(str(folder / chosen) if beside_spec else chosen, place)
     # what is set for all variants holds for those whose recipe reads it
     known = declared_settings(settings.recipe)
     elsewhere = every_path() - set(known)

@@ -1,6 +1,7 @@
 """``lio-jax optimize-graph``: solve a pose graph in a g2o file."""
 
 import json
+import math
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -50,8 +51,10 @@ def optimize_graph(source: Path, out: Path, robust: bool, as_json: bool) -> None
     if robust:
         say(_distrusted(file, solution))
     write_graph(out, eqx.tree_at(lambda graph: graph.poses, graph, solution.poses), file.ids)
+    initial = float(solution.initial_cost)
     result = {
-        "initial_cost": float(solution.initial_cost),
+        # a vertex at 1e200 m has a cost beyond any number, and the solution need not
+        "initial_cost": initial if math.isfinite(initial) else None,
         "final_cost": float(solution.cost),
         "iterations": solution.iterations,
         "status": solution.status,
@@ -62,7 +65,8 @@ def optimize_graph(source: Path, out: Path, robust: bool, as_json: bool) -> None
         return
     loops = int(np.sum(np.asarray(graph.kind) == LOOP))
     print(f"graph       {len(file.ids)} vertices, {len(graph.i)} edges, {loops} of them loops")
-    print(f"cost        {result['initial_cost']:.7g} -> {result['final_cost']:.7g}")
+    before = f"{initial:.7g}" if math.isfinite(initial) else "not finite"
+    print(f"cost        {before} -> {result['final_cost']:.7g}")
     print(f"iterations  {solution.iterations} ({solution.status})")
     print(f"time        {solve_s:.3f} s, and {compile_s:.3f} s to compile")
     print(f"written     {out}")

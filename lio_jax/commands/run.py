@@ -279,7 +279,10 @@ def truth_of(sequence: Sequence, gt: Path | None) -> Trajectory | None:
     loaded = load_trajectory(gt)
     if not loaded.stamped:
         raise UsageError(f"{gt}: has no time stamps; give a TUM file, or KITTI poses with their times.txt.")
-    return loaded.trajectory
+    known = loaded.trajectory.finite()
+    if not len(known):
+        raise UsageError(f"{gt}: holds no pose with finite numbers; give another ground truth.")
+    return known
 
 
 def _finish(result: RunResult, truth: Trajectory | None, settings: Settings, out: Path, name: str) -> str:

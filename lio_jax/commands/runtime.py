@@ -15,7 +15,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 
 import tyro
 
-from lio_jax.core.errors import UsageError
+from lio_jax.core.errors import UsageError, one_line
 
 
 def prepare_jax() -> None:
@@ -64,7 +64,12 @@ def ended_like_ctrl_c() -> Iterator[None]:
 
 
 def say(line: str) -> None:
-    """Print a line to standard error, apart from the results on standard output."""
+    """Print a line to standard error, apart from the results on standard output.
+
+    Notes and warnings are one line each, even if they name a topic with line breaks; tables may have several.
+    """
+    if line.startswith(("note: ", "warning: ")):
+        line = one_line(line)
     print(line, file=sys.stderr, flush=True)
 
 

@@ -195,6 +195,9 @@ def open_bag(paths: Sequence[Path]) -> Iterator["AnyReader"]:
     except Exception as error:
         raise LioJaxError(_why_unreadable(paths, error)) from error
     try:
+        # a damaged table of a database may hold anything in place of text
+        if not all(isinstance(one.topic, str) and isinstance(one.msgtype, str) for one in reader.connections):
+            raise LioJaxError(_unfinished(paths[0], "its list of topics is damaged"))
         yield reader
     finally:
         reader.close()

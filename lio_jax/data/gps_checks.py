@@ -64,14 +64,15 @@ def cleaned(gps: GpsData, source: str) -> tuple[GpsData, tuple[str, ...]]:
 def with_covariances(covariance: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
     """Replace invalid covariances by a plain receiver's, and return a sentence on it; "" where all are valid.
 
-    A covariance is invalid if it is not finite, not symmetric or not positive definite, for example all
-    zeros.
+    A covariance is invalid if it is not finite or impossibly large, not symmetric or not positive definite,
+    for example all zeros.
 
     Args:
         covariance: (n, 3, 3) m^2, east, north, up.
     """
-    finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
-    own = np.where(finite[:, None, None], covariance, 0.0)
+    # the negated comparison also covers NaN
+    possible = np.asarray((np.abs(covariance) < _FARTHEST**2).all(axis=(1, 2)))
+    own = np.where(possible[:, None, None], covariance, 0.0)
     turned = own.transpose(0, 2, 1)
     skewed = np.abs(own - turned).max(axis=(1, 2), initial=0.0)
     scale = np.trace(own, axis1=1, axis2=2)

@@ -103,7 +103,13 @@ class NativeSequence:
     @cached_property
     def _truth(self) -> Trajectory | None:
         path = self._path / "truth.tum"
-        return read_tum(path) if path.is_file() else None
+        if not path.is_file():
+            return None
+        truth = read_tum(path)
+        known = truth.finite()
+        if lost := len(truth) - len(known):
+            self._log.add(f"{path}: {lost} poses held NaN or infinity and were dropped.")
+        return known if len(known) else None
 
     def _load_scan(self, path: Path) -> LidarScan | None:
         try:

@@ -35,6 +35,11 @@ class Trajectory:
         """Return the rotations world from body as quaternions xyzw, (n, 4)."""
         return Rotation.from_matrix(self.poses[:, :3, :3]).as_quat()
 
+    def finite(self) -> "Trajectory":
+        """Return the poses without those that hold NaN or infinity: estimates that failed."""
+        kept = np.isfinite(self.poses).all(axis=(1, 2))
+        return self if kept.all() else Trajectory(self.stamp_ns[kept], self.poses[kept])
+
     def times_body(self, T_body_other: NDArray[np.float64]) -> "Trajectory":
         """Return T_world_other = T_world_body T_body_other."""
         return Trajectory(self.stamp_ns, self.poses @ T_body_other)
@@ -63,9 +68,11 @@ class Trajectory:
 
 
 def pose_matrices(positions: NDArray[np.float64], quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Assemble (n, 4, 4) poses from (n, 3) positions and (n, 4) xyzw quaternions."""
+    """Assemble (n, 4, 4) poses from (n, 3) positions and (n, 4) xyzw quaternions; NaN gives NaN."""
     poses = np.tile(np.eye(4), (len(positions), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
+    finite = np.isfinite(quaternions).all(axis=1)
+    poses[~finite, :3, :3] = np.nan
+    poses[finite, :3, :3] = Rotation.from_quat(quaternions[finite]).as_matrix()
     poses[:, :3, 3] = positions
     return poses
 
@@ -89,6 +96,8 @@ def are_rigid(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 def read_tum(path: Path) -> Trajectory:
     """Read lines ``t x y z qx qy qz qw`` (s, m, xyzw).
+
+    Poses with NaN or infinity are returned as they are: estimates that failed.
 
     Raises:
         LioJaxError: a line does not hold eight numbers, or time does not ascend.

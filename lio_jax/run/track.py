@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.core.xla import programs
 from lio_jax.data.sequence import LidarScan, prefetched
+from lio_jax.data.trajectory import pose_matrices
 from lio_jax.recipes.params import RecipeParams as Params
 from lio_jax.recipes.transforms import RecipeLike, Stepper, reopened, with_first_velocity
 from lio_jax.run.failures import BridgedOutage, OutageWatch, ScanEvidence, failure_of, longest_gap
@@ -396,11 +397,8 @@ def _some(points: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def pose_matrix(wxyz_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the 4x4 matrix of a quaternion (w first) and a translation."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(wxyz_xyz[[1, 2, 3, 0]]).as_matrix()
-    pose[:3, 3] = wxyz_xyz[4:]
-    return pose
+    """Return the 4x4 matrix of a quaternion (w first) and a translation; NaN gives NaN."""
+    return pose_matrices(wxyz_xyz[None, 4:], wxyz_xyz[None, [1, 2, 3, 0]])[0]
 
 
 def _few_features(output: Any) -> tuple[int, int] | None:

@@ -112,16 +112,20 @@ def recipe_of(settings: Settings) -> AnyRecipe:
     return recipe_named(settings.recipe)(settings.config)
 
 
-def recipe_settings(recipe: str) -> Settings:
+def recipe_settings(recipe: str, source: str = "") -> Settings:
     """Return a recipe's own settings.
 
     Args:
         recipe: a name, or ``FILE.py:CLASS``.
+        source: file that names the recipe, for the message; "": the command line.
 
     Raises:
         UsageError: there is no such recipe.
     """
-    chosen = recipe_named(recipe)
+    try:
+        chosen = recipe_named(recipe)
+    except UsageError as error:
+        raise UsageError(f"{source}: {error}" if source else str(error)) from error
     settings = Settings(full_name(recipe), chosen.config_type(), RunConfig(), _numbers(chosen))
     for path, value in chosen.given_values.items():
         settings = settings.with_value(path, value, recipe)
@@ -189,10 +193,7 @@ def settings_from_yaml(text: str, source: str, base: Settings | None = None) -> 
         return base or Settings()
     if not isinstance(tree, dict):
         raise UsageError(f"{source}: expected keys 'recipe', 'config' and 'params', found {tree!r}.")
-    try:
-        settings = base or recipe_settings(str(tree.get("recipe", Settings.recipe)))
-    except UsageError as error:
-        raise UsageError(f"{source}: {error}") from None
+    settings = base or recipe_settings(str(tree.get("recipe", Settings.recipe)), source)
     for path, value in _leaves(tree, source):
         settings = settings.with_value(path, value, source)
     return checked_together(settings, source)

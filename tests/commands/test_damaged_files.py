@@ -1,7 +1,9 @@
 """Damaged files that a fuzz campaign found: each is refused in one sentence that names it, or read."""
 
 import json
+import sqlite3
 import struct
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -191,6 +193,16 @@ def test_a_quaternion_of_no_length(refused, tmp_path, length):
     assert "a.tum: line 2 is not 't x y z" in refused("eval", tmp_path / "a.tum", tmp_path / "a.tum")
 
 
+@pytest.mark.parametrize("word", ["nan", "inf"])
+def test_a_quaternion_that_is_not_finite_is_left_out(accepted, native, word):
+    path = native / "truth.tum"
+    path.write_text(f"0 0 0 0 0 0 0 1\n0.1 1 0 0 {word} 0 0 1\n0.2 2 0 0 0 0 0 1\n")
+    warning = f"warning: {path}: 1 poses held NaN or infinity and were dropped."
+    assert accepted(*to_native(native)) == [warning]
+    assert len((native.parent / "out" / "truth.tum").read_text().splitlines()) == COUNT - 1
+    assert accepted("eval", path, native) == []
+
+
 WRONG_ARRAYS = {
     "stamps of text": ("imu.npz", {"stamp_ns": np.array(["a"] * COUNT)}),
     "fewer samples": ("imu.npz", {"gyro": np.zeros((1, 3))}),
@@ -276,6 +288,11 @@ def test_an_unknown_recipe_in_a_file(refused, tmp_path):
     (tmp_path / "my.yaml").write_text("recipe: '%'")
     sentence = refused("run", tmp_path, "--recipe", tmp_path / "my.yaml", "--out", tmp_path / "out")
     assert f"{tmp_path / 'my.yaml'}: recipe '%' is not known" in sentence
+    (tmp_path / "my.yaml").write_text(
+        "recipe: '%'\nsequences: [{sim: street}]\ngrid: {params.map.voxel_size: [1]}"
+    )
+    sentence = refused("ablate", tmp_path / "my.yaml", "--out", tmp_path / "out")
+    assert f"{tmp_path / 'my.yaml'}: recipe '%' is not known" in sentence
 
 
 def test_a_value_of_thousands_of_letters_is_cut(refused, tmp_path):
@@ -314,6 +331,16 @@ def test_weights_of_a_graph_that_are_too_far_apart(refused, accepted, tmp_path):
     assert "in.g2o: its equations have no solution; some weight is far too large or too small." in sentence
 
 
+def test_a_vertex_so_far_away_that_its_cost_is_not_finite(cli, tmp_path):
+    lines = ["VERTEX_SE2 0 0 0 0", "VERTEX_SE2 1 1e200 0 0", "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1"]
+    (tmp_path / "in.g2o").write_text("\n".join(lines) + "\n")
+    done = cli("optimize-graph", tmp_path / "in.g2o", tmp_path / "out.g2o", "--json")
+    assert done.status == 0, done.err
+    assert json.loads(done.out)["initial_cost"] is None
+    done = cli("optimize-graph", tmp_path / "in.g2o", tmp_path / "out.g2o")
+    assert "cost        not finite -> " in done.out
+
+
 @pytest.mark.parametrize("word", ["9" * 5000, "9" * 30])
 def test_a_fixed_vertex_of_many_digits(refused, tmp_path, word):
     (tmp_path / "in.g2o").write_text(f"EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nFIX {word}\n")
@@ -330,6 +357,46 @@ def test_a_length_in_an_mcap_that_asks_for_all_memory(refused, tmp_path):
     path.write_bytes(data)
     sentence = refused(*to_native(path))
     assert f"{path}: the bag was not closed properly or is truncated (" in sentence
+
+
+def test_a_database_whose_table_of_topics_holds_no_text(refused, tmp_path):
+    path = storage_file(bags.write_bag(tmp_path / "a.db3", bags.velodyne_messages(2)))
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("PRAGMA ignore_check_constraints = ON")
+        database.execute("UPDATE topics SET name = x'00ff'")
+    sentence = refused(*to_native(path))
+    assert (
+        f"{path}: the bag was not closed properly or is truncated (its list of topics is damaged)" in sentence
+    )
+
+
+def test_a_covariance_of_a_fix_that_is_impossibly_large(accepted, tmp_path):
+    fixes = [
+        (
+            "/gps",
+            bags.START_NS + number,
+            bags.fix_message(bags.START_NS + number, 48.0, 11.0, variance=variance),
+        )
+        for number, variance in enumerate((4.0, 1e300, 4.0))
+    ]
+    path = bags.write_bag(tmp_path / "a.mcap", in_order(bags.velodyne_messages(2) + fixes))
+    assert accepted(*to_native(path)) == []
+    with np.load(tmp_path / "out" / "gps.npz") as file:
+        np.testing.assert_array_equal(file["covariance"][:, 0, 0], [4.0, 25.0, 4.0])
+
+
+def test_a_strength_of_an_accelerometer_beyond_all_squares(accepted, tmp_path):
+    messages = imu_messages(30, ros2=True)
+    messages[3][2].linear_acceleration.x = 1e300
+    path = bags.write_bag(tmp_path / "a.mcap", in_order(bags.velodyne_messages(2) + messages))
+    assert accepted(*to_native(path)) == []
+
+
+def test_a_name_of_a_topic_with_line_breaks(accepted, tmp_path):
+    messages = imu_messages(30, ros2=True)
+    cut = [("/imu\n\0 a", received, message) for _, received, message in messages]
+    path = bags.write_bag(tmp_path / "a.mcap", in_order(bags.velodyne_messages(2) + cut + messages[:3]))
+    accepted(*to_native(path))
 
 
 def test_records_of_a_bag_that_contradict_each_other(accepted, tmp_path):
