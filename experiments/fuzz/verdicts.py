@@ -94,7 +94,8 @@ def judge(
         if str(folder) not in last and str(results) not in last:
             return Verdict("unclear", last)
         return Verdict(REFUSED, last)
-    if _NOT_FINITE.search(done.out):
+    # a sentence may speak of what it left out
+    if _NOT_FINITE.search(done.out.replace("NaN or infinity", "")):
         return Verdict("not finite", "in the printed result")
     for path in sorted(results.rglob("*")):
         if found := _not_finite(path, may_be_nan):

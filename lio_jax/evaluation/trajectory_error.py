@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from lio_jax.core.errors import UsageError
@@ -181,7 +182,9 @@ def _evo(trajectory: Trajectory, transform: NDArray[np.float64] | None = None) -
 
     poses = trajectory.poses if transform is None else transform @ trajectory.poses
     seconds = (trajectory.stamp_ns - trajectory.stamp_ns[0]) * 1e-9
-    return PoseTrajectory3D(poses_se3=list(poses), timestamps=seconds)
+    # evo refuses a matrix that is a rotation to a few decimals only, as in files: the nearest one is taken
+    wxyz = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
+    return PoseTrajectory3D(poses[:, :3, 3], wxyz, timestamps=seconds)
 
 
 def _statistics(translation: "PE", rotation: "PE") -> PoseError:

@@ -224,7 +224,7 @@ def read_run(folder: Path) -> RunRecord:
         reading = folder / "scans.npz"
         scans = read_arrays(reading) if reading.is_file() else {}
         for name in (*_COLUMNS, *scans) if scans else ():
-            array_of(scans, name, (len(states["poses"]),), "b" if name in ("lost", "failed") else "fiub")
+            array_of(scans, name, (len(states["poses"]),), "b" if name in ("lost", "failed") else "fiu")
     except (OSError, ValueError) as error:
         raise LioJaxError(f"{reading}: cannot be read ({error}); run again.") from None
     remarks: list[str] = []

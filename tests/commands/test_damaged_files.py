@@ -156,6 +156,12 @@ def test_poses_of_kitti_that_are_no_rotations(refused, kitti, wrong):
     assert expected in refused("eval", kitti.parent / "estimate" / "poses.txt", kitti / "poses.txt")
 
 
+def test_a_rotation_with_few_decimals_is_compared_as_the_nearest_one(accepted, kitti):
+    text = (kitti / "poses.txt").read_text().replace("1.000000000e+00 0.000000000e+00", "1 0.003", 1)
+    (kitti / "poses.txt").write_text(text)
+    assert accepted("eval", kitti / "poses.txt", kitti / "poses.txt") == []
+
+
 @pytest.mark.parametrize("wrong", ["nan", "inf"])
 def test_a_pose_of_kitti_that_is_not_finite_is_left_out(accepted, kitti, wrong):
     text = (kitti / "poses.txt").read_text()
