@@ -85,7 +85,7 @@ _QUATERNION_LENGTHS = (0.1, 10.0)
 
 def are_rigid(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return whether each (3, 4) or (4, 4) matrix is finite and a rotation with a translation, (n,)."""
-    finite = np.isfinite(matrices).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     rotations = np.where(finite[:, None, None], matrices[:, :3, :3], 0.0)
     # an entry of a rotation is at most one; the square of a larger one may overflow
     small = (np.abs(rotations) < 2).all(axis=(1, 2))

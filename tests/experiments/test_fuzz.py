@@ -20,14 +20,14 @@ SLOW = {"run", "run settings", "map", "report", "g2o", "rest"}
 
 def test_a_short_campaign_finds_nothing(tmp_path):
     names = tuple(kind.name for kind in KINDS if kind.name not in SLOW)
-    found = run_campaign(tmp_path, 4 * len(names), kinds=names)
+    found = run_campaign(tmp_path, 2 * len(names), kinds=names)
     assert found.failures == {}, found.table()
     table = found.table()
     assert "traceback" in table
-    assert f"{4 * len(names)} inputs in" in table
+    assert f"{2 * len(names)} inputs in" in table
     for counts in found.verdicts.values():
-        assert counts["inputs"] == 4
-        assert counts[ACCEPTED] + counts[REFUSED] == 4
+        assert counts["inputs"] == 2
+        assert counts[ACCEPTED] + counts[REFUSED] == 2
 
 
 def verdict_on(folder, ends="", may_be_nan=(), **done):
