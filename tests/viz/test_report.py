@@ -212,3 +212,48 @@ def test_metrics_of_an_older_run_do(tmp_path):
     (folder / "metrics.json").write_text(json.dumps({"scans": 60, "failures": []}))
     (folder / "scans.npz").unlink()
     assert {"Way from above", "Gyroscope bias"} <= set(titles(write_report(folder).read_text()))
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("scans.npz", lambda arrays: {"step_ms": arrays["step_ms"] > 0}),
+        ("scans.npz", lambda arrays: {"failed": arrays["failed"][:-1]}),
+        ("states.npz", lambda arrays: {"velocity": arrays["velocity"][:, :2]}),
+        ("states.npz", lambda arrays: {"stamps_ns": arrays["stamps_ns"].astype(float)}),
+    ],
+)
+def test_columns_of_another_form_are_refused(tmp_path, name, change):
+    run = write_run(tmp_path / "run")
+    with np.load(run / name) as file:
+        arrays = dict(file)
+    changed = change(arrays)
+    np.savez(run / name, **(arrays | changed))
+    with pytest.raises(LioJaxError, match=rf"{name}: cannot be read \({next(iter(changed))} is an array"):
+        write_report(run)
+
+
+@pytest.mark.parametrize(
+    ("metrics", "problem"),
+    [
+        ([], "the whole is no object"),
+        ({"verdict": {"state": "sound"}}, "verdict lacks since_s"),
+        ({"backend": {"keyframes": "a", "loops": {}}}, "backend lacks gps"),
+        ({"warnings": 3}, "warnings is no list"),
+        ({"failures": [{}]}, "an entry of failures lacks message"),
+        ({"wall_s": None}, "wall_s is 'None'"),
+    ],
+)
+def test_metrics_of_another_form_are_refused(tmp_path, metrics, problem):
+    run = write_run(tmp_path / "run")
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    with pytest.raises(LioJaxError, match=rf"metrics\.json: cannot be read \({problem}\); run again"):
+        write_report(run)
+
+
+@pytest.mark.parametrize("text", ["a: [\n", "", "- 1"])
+def test_a_configuration_that_is_none_is_refused_in_one_line(tmp_path, text):
+    run = write_run(tmp_path / "run")
+    (run / "config.yaml").write_text(text)
+    with pytest.raises(LioJaxError, match=r"config\.yaml: cannot be read \([^\n]*\); run again\.$"):
+        write_report(run)
