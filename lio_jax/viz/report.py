@@ -39,6 +39,7 @@ def write_report(folder: Path, out: Path | None = None) -> Path:
 def run_report(run: RunRecord) -> str:
     """Return the report of one run as HTML."""
     compared = run.comparison
+    environment = [(name, str(value)) for name, value in run.metrics.get("environment", {}).items()]
     return page(
         f"lio-jax: {run.title}",
         [
@@ -53,7 +54,7 @@ def run_report(run: RunRecord) -> str:
             section("Matching", figures(*run_figures.matching(run))),
             section("Time", figures(*run_figures.times(run))),
             section("Notes", bullets(run.metrics.get("notes", []))),
-            section("Environment", table(("", ""), run.metrics.get("environment", {}).items())),
+            section("Environment", table(("", ""), environment)),
             section("Configuration", folded("config.yaml, every value resolved", run.config_yaml)),
         ],
     )

@@ -257,3 +257,10 @@ def test_a_configuration_that_is_none_is_refused_in_one_line(tmp_path, text):
     (run / "config.yaml").write_text(text)
     with pytest.raises(LioJaxError, match=r"config\.yaml: cannot be read \([^\n]*\); run again\.$"):
         write_report(run)
+
+
+def test_a_version_that_is_a_number_is_shown(tmp_path):
+    run = write_run(tmp_path / "run")
+    metrics = json.loads((run / "metrics.json").read_text()) | {"environment": {"jaxlib": 123456}}
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    assert "123456" in write_report(run).read_text()
