@@ -122,15 +122,12 @@ class LidarCovariance(eqx.Module):
     ) -> Float[Array, "24 24"]:
         """Return a covariance after some time of white acceleration."""
         carry = _carry(before, nav, seconds)
-        angular, linear = jnp.repeat(self.acceleration, 3).reshape(2, 3)
-        pairs = ((ROTATION, _RATE, jnp.diag(angular)), (POSITION, VELOCITY, jnp.diag(linear)))
-        noise = jnp.zeros_like(covariance)
-        for place, speed, density in pairs:
-            noise = noise.at[place, place].set(density * seconds**3 / 3)
-            noise = noise.at[place, speed].set(density * seconds**2 / 2)
-            noise = noise.at[speed, place].set(density * seconds**2 / 2)
-            noise = noise.at[speed, speed].set(density * seconds)
-        return carry @ covariance @ carry.T + noise
+        angular, linear = self.acceleration[:, None, None] * jnp.eye(3, dtype=carry.dtype)
+        blocks = []
+        for place, speed, density in ((ROTATION, _RATE, angular), (POSITION, VELOCITY, linear)):
+            blocks += [(place, place, density * seconds**3 / 3), (speed, speed, density * seconds)]
+            blocks += [(place, speed, density * seconds**2 / 2), (speed, place, density * seconds**2 / 2)]
+        return carry @ covariance @ carry.T + from_blocks((DOF, DOF), *blocks)
 
     def _learnt(
         self, motion: TrialMotion, twist: Float[Array, "6"], scans: Int32[Array, ""], learns: Bool[Array, ""]
@@ -163,13 +160,19 @@ def _by_body(nav: NavState) -> Float[Array, "24 24"]:
 def _carry(before: NavState, nav: NavState, seconds: Float[Array, ""]) -> Float[Array, "24 24"]:
     """Return the derivative of a state's error by that some time before; the body keeps its own velocity."""
     way = adjoint(nav.T_world_imu.inverse() @ before.T_world_imu)
-    identity = jnp.eye(DOF, dtype=way.dtype)
+    velocity = rotation_matrix(nav.T_world_imu.rotation()).T @ nav.velocity
     # the right Jacobian of the exponential, to second order in the time
     turn = seconds * jnp.eye(3, dtype=way.dtype) - seconds**2 / 2 * skew(nav.gyro_bias)
-    velocity = rotation_matrix(nav.T_world_imu.rotation()).T @ nav.velocity
-    kept = identity.at[_POSE, _POSE].set(way).at[ROTATION, _RATE].set(turn).at[POSITION, VELOCITY].set(turn)
-    kept = kept.at[POSITION, _RATE].set(-(seconds**2) / 2 * skew(velocity))
-    return (2 * identity - _by_body(nav)) @ kept @ _by_body(before)
+    rest = slice(POSITION.stop, DOF)
+    kept = from_blocks(
+        (DOF, DOF),
+        (_POSE, _POSE, way),
+        (rest, rest, jnp.eye(DOF - POSITION.stop, dtype=way.dtype)),
+        (ROTATION, _RATE, turn),
+        (POSITION, VELOCITY, turn),
+        (POSITION, _RATE, -(seconds**2) / 2 * skew(velocity)),
+    )
+    return (2 * jnp.eye(DOF, dtype=way.dtype) - _by_body(nav)) @ kept @ _by_body(before)
 
 
 def _matched(

@@ -135,7 +135,8 @@ def step(
         vmap = following(vmap, state.map, added.added, anchored, inserted, placing, anchor, size)
 
     with jax.named_scope("covariance"):
-        matched = match.points_at(T)
+        # not compensated: their ranges and the angles under which they are seen hardly differ
+        matched = thin.points[index]
         on_map = ScanOnMap(
             match=result,
             degeneracy_ratio=params.registration.degeneracy_ratio,

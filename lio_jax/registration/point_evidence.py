@@ -28,6 +28,8 @@ class PointEvidence(eqx.Module):
 
 _PLANE_DOF = 3
 """A plane through so many points shows none of their noise."""
+_EVERY = 4
+"""One of so many points is enough for a mean over all."""
 _UNSHARED = 2
 """Number of a plane's three coordinates whose error a scan line across it does not average out: its offset,
 and its tilt across the line."""
@@ -81,7 +83,7 @@ def plane_share(
     frame: Frame,
     lidar: BeamParams,
 ) -> Float[Array, ""]:
-    """Return ``PointEvidence.plane_share`` alone, without a derivative.
+    """Return ``PointEvidence.plane_share`` alone, by some of the points and without a derivative.
 
     A plane through n points with the variance l0 along its normal is off by the variance 2 l0 / (n - 3) where
     a scan line crosses it, and all points of the scan in its voxel share that error. For the sum of m of them
@@ -92,14 +94,23 @@ def plane_share(
     """
     settings = matches, points, T_world_lidar, lidar
     matches, points, T_world_lidar, lidar = jax.lax.stop_gradient(settings)
+    matches, points = jax.tree.map(lambda rows: rows[::_EVERY] if rows.ndim else rows, (matches, points))
+    shared = _shared(slots, matches, points.dtype, _EVERY)
     noise = point_noise(matches, points, T_world_lidar, frame, lidar)
-    shared = _shared(slots, matches, points.dtype)
     return jnp.sum(shared * matches.variances[:, 0] / noise.variance).astype(T_world_lidar.wxyz_xyz.dtype)
 
 
-def _shared(slots: int, matches: Matches, kind: jnp.dtype) -> Float[Array, " k"]:
-    """Return 2 m / (n - 3) of each point's voxel, divided by the number of matched points."""
-    together = jnp.where(matches.used, matches.in_same_voxel(slots), 0).astype(kind)
+def _shared(slots: int, matches: Matches, kind: jnp.dtype, every: int = 1) -> Float[Array, " k"]:
+    """Return 2 m / (n - 3) of each point's voxel, divided by the number of matched points.
+
+    Args:
+        slots: size of the map's table.
+        matches: of the points, or of one of so many.
+        kind: dtype of the result.
+        every: the number of points for which one stands; each of the others in its voxel counts as so many.
+    """
+    others = every * (matches.in_same_voxel(slots) - 1)
+    together = jnp.where(matches.used, 1 + others, 0).astype(kind)
     alone = _UNSHARED / jnp.maximum(matches.count - _PLANE_DOF, 1)
     return together * alone / jnp.maximum(jnp.sum(matches.used), 1)
 
