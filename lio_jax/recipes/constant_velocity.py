@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.error_state import DOF, VELOCITY, NavEstimate, SweptState
+from lio_jax.core.error_state import DOF, GRAVITY, VELOCITY, NavEstimate, SweptState
 from lio_jax.core.types import ImuBatch, NavState, Scan, initial_nav_state
+from lio_jax.estimation.map_drift import MapDrift
 from lio_jax.imu.discretise import UNKNOWN_ACCEL, UNKNOWN_RATE
 from lio_jax.imu.initialise import MOVING_SPEED
 from lio_jax.imu.path import Path
@@ -92,6 +93,16 @@ def predicted_without_samples(
     )
     nav = dataclasses.replace(prior.nav, gravity=last.nav.gravity)
     return SweptState(nav, prior.covariance, prior.transition), path
+
+
+def with_gravity_held(state: NavEstimate, drift: MapDrift) -> tuple[NavEstimate, MapDrift]:
+    """Return state and drift without an error of gravity's direction: no scan tells it.
+
+    A map that is turned by its error would share that error with it.
+    """
+    kept = jnp.ones(DOF, state.covariance.dtype).at[GRAVITY].set(0.0)
+    covariance = kept[:, None] * state.covariance * kept
+    return NavEstimate(state.nav, covariance), dataclasses.replace(drift, cross=kept[:, None] * drift.cross)
 
 
 def _imagined_samples(nav: NavState, rate: Float[Array, "3"], scan: Scan) -> ImuBatch:

@@ -35,6 +35,7 @@ from lio_jax.recipes.constant_velocity import (
     predicted_without_samples,
     unlevelled_start,
     until_its_middle,
+    with_gravity_held,
 )
 from lio_jax.recipes.inertial_filter import (
     corrected,
@@ -298,6 +299,8 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
             new = jnp.sum(added.added) / jnp.maximum(jnp.sum(thin.mask), 1)
             by_planes = planes_met(update, posterior.nav, jnp.full_like(to_end, PLANE_SHARE))
             after, grown = drift.grown(posterior, new, by_planes, state.scans)
+            if imu is None:
+                after, grown = with_gravity_held(after, grown)
         seen = jnp.any(thin.mask)
         rate = jnp.where(first | lost, rate, mean_rate(state.uncertain.nav, posterior.nav, scan))
         new_state = FastLio2State(

@@ -96,6 +96,7 @@ def test_states_have_their_shapes(run):
         "nis": (COUNT,),
         "nis_dof": (COUNT,),
         "covariance": (COUNT, 6, 6),
+        "state_covariance": (COUNT, 24, 24),
     }
     assert states["stamps_ns"].dtype == np.int64
     assert states["poses"].dtype == np.float64
