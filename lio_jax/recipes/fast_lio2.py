@@ -8,7 +8,7 @@ Xu, Cai, He, Lin & Zhang, "FAST-LIO2: Fast direct LiDAR-inertial odometry", T-RO
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -38,9 +38,9 @@ from lio_jax.recipes.constant_velocity import (
     with_gravity_held,
 )
 from lio_jax.recipes.inertial_filter import (
+    after_match,
     corrected,
     evidence_of,
-    in_new_piece,
     levelled_start,
     lidar_pose,
     planes_met,
@@ -289,11 +289,9 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
             cube_map = move_cube(inserted, frame.anchor, *in_blocks)
             cube_map = following(cube_map, state.map, inserted, added.added, moving, frame.anchor, voxel_size)
 
-        drift = state.drift
-        if update.considered is not None:
-            drift = replace(drift, cross=update.considered)
-        drift = drift.carried(state.uncertain.nav.T_world_imu, posterior.nav.T_world_imu)
-        posterior, drift = in_new_piece(posterior, drift, jnp.zeros_like(to_end), new_piece)
+        before, no_sweep = state.uncertain.nav.T_world_imu, jnp.zeros_like(to_end)
+        cross = update.considered
+        posterior, drift = after_match(posterior, state.drift, cross, before, no_sweep, new_piece)
         after, grown = posterior, drift
         if not config.fast_lio2.exact_map:
             new = jnp.sum(added.added) / jnp.maximum(jnp.sum(thin.mask), 1)

@@ -1,6 +1,7 @@
 """What the recipes with an error-state filter share: the start, the prediction, and the update by a scan
 match."""
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -259,21 +260,31 @@ def planes_met(update: Update, nav: NavState, share: Float[Array, ""]) -> Float[
     )
 
 
-def in_new_piece(
-    state: NavEstimate, drift: MapDrift, sweep: Float[Array, ""], begins: Bool[Array, ""]
+def after_match(
+    matched: NavEstimate,
+    drift: MapDrift,
+    cross: Float[Array, "24 6"] | None,
+    T_before: jaxlie.SE3,
+    sweep: Float[Array, ""],
+    begins: Bool[Array, ""],
 ) -> tuple[NavEstimate, MapDrift]:
-    """Return state and drift with the pose's error moved into the drift where a new piece of map begins.
+    """Return state and drift after a match, as seen from the new pose.
 
-    Within the new piece the pose is certain. What is known of the velocity and of gravity's direction
-    relative to the body stays known.
+    Where a new piece of map begins, the pose's error is moved into the drift: within the new piece the pose
+    is certain. What is known of the velocity and of gravity's direction relative to the body stays known.
 
     Args:
-        state: predicted, at the sweep's end.
-        drift: of the map so far.
-        sweep: the scan's duration, s: the pose is certain in the sweep's mean.
+        matched: state at the sweep's end; the prediction where a new piece begins.
+        drift: before the match, seen from ``T_before``.
+        cross: covariance of the state's error with the map's after the match; None: that of ``drift`` stays.
+        T_before: pose of the state before.
+        sweep: the scan's duration, s: in a new piece the pose is certain in the sweep's mean.
         begins: a new piece begins.
     """
-    nav, covariance = state.nav, state.covariance
+    if cross is not None:
+        drift = replace(drift, cross=cross)
+    drift = drift.carried(T_before, matched.nav.T_world_imu)
+    nav, covariance = matched.nav, matched.covariance
     dtype = covariance.dtype
     R_world_imu = rotation_matrix(nav.T_world_imu.rotation())
     moved = jnp.eye(DOF, dtype=dtype).at[ROTATION].set(0.0).at[POSITION].set(0.0)

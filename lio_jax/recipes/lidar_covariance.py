@@ -19,7 +19,7 @@ from lio_jax.estimation.map_drift import MapDrift, error_by_planes
 from lio_jax.estimation.pose_measurement import keep_observed, lidar_pose_jacobian
 from lio_jax.imu.initialise import MOVING_SPEED
 from lio_jax.lidar.deskew import TrialMotion
-from lio_jax.recipes.inertial_filter import in_new_piece
+from lio_jax.recipes.inertial_filter import after_match
 from lio_jax.registration.gauss_newton import Registration
 
 _POSE = slice(ROTATION.start, POSITION.stop)
@@ -99,9 +99,9 @@ class LidarCovariance(eqx.Module):
         predicted = moving._carried(self.covariance, before, nav, seconds)
         cross = _carry(before, nav, seconds) @ self.drift.cross
         covariance, cross, information = _matched(predicted, cross, nav, scan)
-        drift = dataclasses.replace(self.drift, cross=cross).carried(T_last, T)
         no_sweep = jnp.zeros_like(seconds)
-        within, drift = in_new_piece(NavEstimate(nav, covariance), drift, no_sweep, scan.new_piece)
+        matched = NavEstimate(nav, covariance)
+        within, drift = after_match(matched, self.drift, cross, T_last, no_sweep, scan.new_piece)
         by_planes = error_by_planes(information, scan.arm_squared, nav, scan.plane_share)
         after, grown = drift.grown(within, scan.added, by_planes, scans)
         learns = observing & motion.known & (scans > 1)

@@ -4,8 +4,6 @@ scan -> thin --------> deskew -> iterated update (match, linearise) -> insert ->
 imu  -> propagate --/------------/
 """
 
-from dataclasses import replace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,9 +21,9 @@ from lio_jax.mapping.voxel_map import VoxelMap, empty_map, following, insert
 from lio_jax.recipes import recipe
 from lio_jax.recipes.default_params import DefaultConfig, DefaultParams
 from lio_jax.recipes.inertial_filter import (
+    after_match,
     corrected,
     evidence_of,
-    in_new_piece,
     levelled_start,
     lidar_pose,
     planes_met,
@@ -147,10 +145,8 @@ def step(
         vmap = following(vmap, state.map, added.added, placed, inserted, again, frame.anchor, size)
 
         new = jnp.sum(added.added) / jnp.maximum(jnp.sum(thin.mask), 1)
-        assert update.considered is not None
-        drift = replace(state.drift, cross=update.considered)
-        drift = drift.carried(state.nav.T_world_imu, posterior.nav.T_world_imu)
-        within, drift = in_new_piece(posterior, drift, scan.duration, new_piece)
+        before, cross = state.nav.T_world_imu, update.considered
+        within, drift = after_match(posterior, state.drift, cross, before, scan.duration, new_piece)
         by_planes = planes_met(update, posterior.nav, evidence.plane_share)
         after, grown = drift.grown(within, new, by_planes, state.scans)
 
