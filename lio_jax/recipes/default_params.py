@@ -13,15 +13,18 @@ from lio_jax.recipes.params import InertialConfig, InertialParams, MotionParams
 from lio_jax.registration.params import GaussNewtonMatch, RobustFilterMatch, ThinnedMatch
 
 
-class InertialThinning(eqx.Module):
-    """Thinning of the scan where a filter predicts its pose."""
+class InertialMatch(eqx.Module):
+    """What differs in the match where a filter predicts the pose."""
 
     inertial_point_spacing: Scalar = leaf(0.5, "m", above=0)
     """With inertial samples, the scan is thinned to one point per cube of this edge length before it is
     matched: the prediction needs fewer points to correct it."""
+    least_width: Scalar = leaf(0.15, least=0)
+    """With inertial samples, a voxel whose second largest standard deviation is below this share of its size
+    acts as a scan line, which defines no plane; a wider one acts as if it were as much narrower."""
 
 
-class VoxelMatch(GaussNewtonMatch, RobustFilterMatch, ThinnedMatch, InertialThinning):
+class VoxelMatch(GaussNewtonMatch, RobustFilterMatch, ThinnedMatch, InertialMatch):
     """A match with the planes of a voxel map, by Gauss-Newton or in the filter."""
 
 

@@ -120,7 +120,7 @@ def step(
             prediction_error=state.prediction_error,
             map_params=params.map,
             lidar=params.lidar,
-            with_lines=False,
+            least_width=params.registration.least_width,
         )
         considered = prior.transition @ state.drift.cross
         update, matched = corrected(prior, match, config.registration.max_iterations, considered)

@@ -37,8 +37,8 @@ class Matches(eqx.Module):
     """Where the map holds the voxel."""
     used: Bool[Array, " k"]
     """True where a point has a match."""
-    with_lines: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.array(True))
-    """Whether the spread of a scan line by its noise counts as a plane; see :func:`point_noise`."""
+    least_variance: Float[Array, ""] | float = 0.0
+    """Variance across which a voxel is narrow, m^2; see :func:`point_noise`."""
 
     def coordinates_in(self, vmap: VoxelMap) -> Float[Array, "k 5"]:
         """Return coordinates of the matches, by which they have a derivative, as functions of their voxels.
@@ -199,14 +199,15 @@ def point_noise(
 
     A point is measured along the normal of its voxel, with the precision
     k = 1 / (s^2 + l0) - 1 / (s^2 + m), where l0 <= l1 are the two smaller variances of the voxel and
-    m = max(l0, l1 - r^2): what is known about the normal in excess of the next direction. A flat voxel acts
-    as a plane; a shapeless one does not act at all, and neither does a single scan line, with no class
-    boundaries between. The noise of the ranges spreads a scan line along the beams, by the variance r^2 of
-    range and surface. That spread is no surface: its plane contains the beams, which meet the ground at a
-    small angle, and it presses the scan up or down as soon as the vehicle moves. Where there is nothing else
-    to go by, such planes are better than none: ``with_lines`` takes m = l1. The point's own variance
-    s^2 is r^2 plus that of the beam's direction times the squared offset along the surface, which grows with
-    range and grazing incidence.
+    m = max(l0, l1 - b): what is known about the normal in excess of the next direction. A flat voxel acts
+    as a plane; a shapeless one does not act at all, and neither does a narrow one, with no class boundaries
+    between. Narrow is a scan line that noise or the vehicle's motion has spread to less than the variance b,
+    ``Matches.least_variance``. Noise spreads it along the beams, which meet the ground at a small angle.
+    Motion moves it over the surface, and the tilt of the strip is the error of the motion: the next scan
+    continues it, so that the strip confirms any drift. Where there is nothing else to go by, such planes are
+    better than none, and b is zero. The point's own variance s^2 is r^2, that of range and surface, plus that
+    of the beam's direction times the squared offset along the surface, which grows with range and grazing
+    incidence.
     """
     R, shift = frame.placing(T_world_lidar, points.dtype)
     arm = jnp.where(matches.used[:, None], points, 0.0) @ R.T
@@ -224,8 +225,7 @@ def plane_noise(matches: Matches, arm: Array, shift: Array, facing: Array, turni
     range_squared = jnp.sum(arm**2, -1)
     across = jnp.maximum(range_squared - along**2, 0.0)
     flat, wide = matches.variances[:, 0], matches.variances[:, 1]
-    by_noise = jnp.where(matches.with_lines, 0.0, facing)
-    shaped = jnp.stack([flat, jnp.maximum(flat, wide - by_noise)], -1)
+    shaped = jnp.stack([flat, jnp.maximum(flat, wide - matches.least_variance)], -1)
     variances = (facing + turning * across)[:, None] + shaped
     known = 1 / variances
     distance = jnp.sum(matches.normal * (arm + shift - matches.mean), -1)
@@ -345,21 +345,23 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
     """Expected error of the prediction, m."""
     map_params: VoxelMapParams
     lidar: BeamParams
-    with_lines: bool = eqx.field(static=True, default=True)
-    """Whether scan lines count as planes. They should not where inertial samples predict the pose."""
+    least_width: Float[Array, ""] | float = 0.0
+    """Standard deviation across a voxel, as a share of its size, by which its points are wide enough for a
+    plane; 0: scan lines count as planes. They should not where inertial samples predict the pose."""
 
     def together(self, points: Float[Array, "k 3"]) -> tuple[Float[Array, "k 3"], Bool[Array, " k"]]:
         return points, self.mask
 
     def unmatched(self) -> Matches:
-        return self._counting_lines(no_matches(self.mask, self.map.moments.dtype))
+        return self._by_width(no_matches(self.mask, self.map.moments.dtype))
 
     def associate(self, points: Float[Array, "k 3"], T_world_lidar: jaxlie.SE3) -> Matches:
         found = associate(self.map, points, self.mask, T_world_lidar, self.frame(), self.map_params)
-        return self._counting_lines(found)
+        return self._by_width(found)
 
-    def _counting_lines(self, found: Matches) -> Matches:
-        return replace(found, with_lines=jnp.array(self.with_lines))
+    def _by_width(self, found: Matches) -> Matches:
+        width = self.least_width * self.map_params.voxel_size
+        return replace(found, least_variance=jax.lax.stop_gradient(width**2).astype(found.variances.dtype))
 
     def linearise(
         self, T_world_lidar: jaxlie.SE3, found: Matches, iteration: Int32[Array, ""]

@@ -60,6 +60,22 @@ def test_errors_of_a_drive_that_begins_at_speed_are_as_large_as_default_says():
     assert 0.25 < velocity < 4
 
 
+@cache
+def sixteen_beams():
+    return [SimulatedSequence("city", "vlp16", duration_s=12.0, imu=ImuModel(), seed=seed) for seed in (3, 4)]
+
+
+def test_the_strips_that_few_beams_sweep_over_a_surface_leave_the_pose_as_good_as_its_covariance_says():
+    pose, velocity = normalised(sixteen_beams(), "default")
+    assert 0.25 < pose < 4
+    assert 0.25 < velocity < 4
+
+
+def test_strips_taken_for_planes_confirm_a_drift_that_the_covariance_does_not_know():
+    pose, _ = normalised(sixteen_beams(), "default", ["params.registration.least_width=0"])
+    assert pose > 4
+
+
 @pytest.mark.parametrize(("recipe", "overrides"), [("default", LIDAR_ONLY), ("fast_lio2", [])])
 def test_errors_in_a_street_are_as_large_as_the_covariance_says(recipe, overrides):
     pose, velocity = normalised(streets(), recipe, overrides)

@@ -202,22 +202,23 @@ def test_sums_are_those_of_the_matched_points(kernel):
     np.testing.assert_allclose(found.arm_squared, (points.astype(float) ** 2).sum(1).mean(), rtol=1e-5)
 
 
-@pytest.mark.parametrize("with_lines", [True, False])
-def test_a_scan_line_that_its_noise_has_spread_is_no_plane_unless_lines_count(with_lines):
+@pytest.mark.parametrize("width", [0.0, SIGMA, 0.3])
+def test_a_voxel_acts_as_narrower_by_the_least_width_and_a_narrow_one_is_no_plane(width):
     points, patch = scan(400, 0.3)
     frame = Frame(*anchor_of(TRUTH.translation(), PARAMS.map.voxel_size))
     mask = jnp.ones(len(points), bool)
     matches = associate(MAP, jnp.asarray(points), mask, TRUTH, frame, PARAMS.map)
-    matches = replace(matches, with_lines=jnp.array(with_lines))
+    matches = replace(matches, least_variance=jnp.float32(width**2))
     found = point_noise(matches, jnp.asarray(points), TRUTH, frame, PARAMS.lidar).precision
     expected = []
     for held in held_points():
         flat, wide, _ = np.linalg.eigvalsh(np.cov(held.T, bias=True))
-        wide = wide if with_lines else max(flat, wide - SIGMA**2)
+        wide = max(flat, wide - width**2)
         expected.append(1 / (SIGMA**2 + flat) - 1 / (SIGMA**2 + wide))
     np.testing.assert_allclose(found, np.array(expected)[patch], rtol=1e-3, atol=0.05)
     lines = [number for number, value in enumerate(expected) if value < 1e-9]
-    assert bool(lines) != with_lines
+    assert bool(lines) == (width > 0)
+    assert len(lines) < len(expected)
 
 
 def blur(points, patch, T) -> float:
