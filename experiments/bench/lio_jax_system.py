@@ -11,7 +11,11 @@ from systems import Pose
 
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.lidar.params import RingConfig
-from lio_jax.run.fitted_settings import with_inertial_noise, with_sensor_sizes
+from lio_jax.run.fitted_settings import (
+    with_inertial_noise,
+    with_range_noise,
+    with_sensor_sizes,
+)
 from lio_jax.run.run import imu_feed
 from lio_jax.run.scan_inputs import bucket_for
 from lio_jax.run.track import CompiledStep, pose_matrix, run_steps, scan_inputs
@@ -101,9 +105,11 @@ def sizes_for(recipe: str, scans: list[LidarScan]) -> tuple[str, ...]:
 
 
 def noise_for(recipe: str, sequence: Sequence) -> tuple[str, ...]:
-    """Return as overrides the noise of the inertial samples that a recipe takes from the recording."""
+    """Return as overrides the noise of the sensors that a recipe takes from the recording."""
     fitted = with_inertial_noise(sequence, recipe_settings(recipe))[0]
-    return tuple(f"params.imu.{name}={fitted.values['imu'][name]}" for name in ("gyro_noise", "accel_noise"))
+    fitted = with_range_noise(fitted, sequence.scans())[0]
+    inertial = (f"params.imu.{name}={fitted.values['imu'][name]}" for name in ("gyro_noise", "accel_noise"))
+    return (*inertial, f"params.lidar.range_sigma={fitted.values['lidar']['range_sigma']}")
 
 
 @cache

@@ -1,11 +1,16 @@
 """Range residuals of a scan against planes through neighbouring returns: the range noise, without a map."""
 
+from collections.abc import Iterable
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy.optimize import brentq
 
 from lio_jax.core.types import Scan
-from lio_jax.lidar.params import LidarParams
+from lio_jax.lidar.params import BeamParams, LidarParams
 
 _APART = (1e-5, 0.025)
 """Smallest and largest angle between neighbours of a ring, rad. Closer returns belong to one pulse; between
@@ -71,3 +76,41 @@ def range_scatter(scan: Scan, lidar: LidarParams) -> RangeScatter:
 def _angle(one: Float[Array, "t 3"], other: Float[Array, "t 3"]) -> Float[Array, " t"]:
     """Return the angles between unit vectors, rad; from the chord, which is precise for small angles."""
     return 2 * jnp.arcsin(jnp.minimum(jnp.linalg.norm(one - other, axis=-1) / 2, 1.0))
+
+
+_MEDIAN_OF_NORMAL = 0.6745
+"""Median of the absolute value of a standard normal variable."""
+_LEAST_SIGMA, _LARGEST_SIGMA = 1e-4, 1.0
+"""Interval of a range's standard deviation, m."""
+
+
+def scattered_range_noise(scans: Iterable[Scan], lidar: LidarParams, fewest: int) -> float | None:
+    """Return the standard deviation of a range by the median of the scatter of neighbouring returns, m.
+
+    The median does not follow edges between neighbours, unless they are as many as the planes.
+
+    Args:
+        scans: padded sweeps.
+        lidar: bounds of the ranges, and the noise of the beams' directions where it is known.
+        fewest: number of residuals below which nothing is said.
+
+    Returns:
+        the noise; None for too few residuals.
+    """
+    found = [jax.device_get(_scatter_of(scan, lidar)) for scan in scans]
+    parts = [[getattr(one, name)[one.valid] for one in found] for name in ("deviation", "spread", "slope")]
+    if sum(map(len, parts[0])) < fewest:
+        return None
+    deviation, spread, slope = (np.concatenate(part).astype(np.float64) for part in parts)
+    angle = float(lidar.angle_sigma) if isinstance(lidar, BeamParams) else 0.0
+
+    def excess(sigma: float) -> float:
+        variance = (sigma * spread) ** 2 + (angle * slope) ** 2
+        return float(np.median(np.abs(deviation) / np.sqrt(variance))) - _MEDIAN_OF_NORMAL
+
+    if excess(_LEAST_SIGMA) <= 0 or excess(_LARGEST_SIGMA) >= 0:
+        return None
+    return float(brentq(excess, _LEAST_SIGMA, _LARGEST_SIGMA, xtol=1e-5))
+
+
+_scatter_of = jax.jit(range_scatter)

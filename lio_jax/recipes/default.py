@@ -24,6 +24,7 @@ class Default(Recipe[DefaultConfig, DefaultParams, DefaultState]):
         "params.map.point_spacing": 0.1,
         "params.registration.point_spacing": 0.2,
         "params.registration.inertial_point_spacing": 0.2,
+        "params.registration.least_width": 0.04,
     }
 
     noise_from_recording = True

@@ -19,9 +19,9 @@ class InertialMatch(eqx.Module):
     inertial_point_spacing: Scalar = leaf(0.5, "m", above=0)
     """With inertial samples, the scan is thinned to one point per cube of this edge length before it is
     matched: the prediction needs fewer points to correct it."""
-    least_width: Scalar = leaf(0.15, least=0)
-    """With inertial samples, a voxel whose second largest standard deviation is below this share of its size
-    acts as a scan line, which defines no plane; a wider one acts as if it were as much narrower."""
+    least_width: Scalar = leaf(0.18, "m", least=0)
+    """With inertial samples, a voxel whose second largest standard deviation is smaller acts as a scan line,
+    which defines no plane; a wider one acts as if it were as much narrower."""
 
 
 class VoxelMatch(GaussNewtonMatch, RobustFilterMatch, ThinnedMatch, InertialMatch):

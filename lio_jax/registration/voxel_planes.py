@@ -346,8 +346,8 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
     map_params: VoxelMapParams
     lidar: BeamParams
     least_width: Float[Array, ""] | float = 0.0
-    """Standard deviation across a voxel, as a share of its size, by which its points are wide enough for a
-    plane; 0: scan lines count as planes. They should not where inertial samples predict the pose."""
+    """Standard deviation across a voxel below which its points define no plane, m; 0: scan lines count as
+    planes. They should not where inertial samples predict the pose."""
 
     def together(self, points: Float[Array, "k 3"]) -> tuple[Float[Array, "k 3"], Bool[Array, " k"]]:
         return points, self.mask
@@ -360,8 +360,8 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
         return self._by_width(found)
 
     def _by_width(self, found: Matches) -> Matches:
-        width = self.least_width * self.map_params.voxel_size
-        return replace(found, least_variance=jax.lax.stop_gradient(width**2).astype(found.variances.dtype))
+        least = jax.lax.stop_gradient(jnp.asarray(self.least_width**2, found.variances.dtype))
+        return replace(found, least_variance=least)
 
     def linearise(
         self, T_world_lidar: jaxlie.SE3, found: Matches, iteration: Int32[Array, ""]

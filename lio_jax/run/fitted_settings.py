@@ -12,8 +12,10 @@ from lio_jax.data.imu_checks import cleaned
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.imu.allan import noise_in_motion
 from lio_jax.lidar.params import RingConfig
+from lio_jax.lidar.range_scatter import scattered_range_noise
 from lio_jax.recipes import recipe_named
 from lio_jax.recipes.params import InertialConfig
+from lio_jax.run.scan_inputs import padded
 from lio_jax.settings.settings import Settings, declared_settings
 
 _NEAR_M, _SHARE = 10.0, 90
@@ -34,7 +36,7 @@ def fitted_to_surroundings(sequence: Sequence, settings: Settings) -> tuple[Sett
     Voxels and spacings are changed together: if the user sets one of them, none is changed.
     """
     near = recipe_named(settings.recipe).near_values
-    together = {path for path in near if path != "params.lidar.min_range"}
+    together = {path for path in near if path.endswith(("voxel_size", "spacing"))}
     given = settings.given | (together if settings.given & together else set())
     free = [path for path in near if path not in given]
     if not free:
@@ -95,6 +97,40 @@ def with_inertial_noise(sequence: Sequence, settings: Settings) -> tuple[Setting
     if not words:
         return settings, []
     return settings, [f"noise of the inertial samples, with a margin of {_MARGIN:g}: {', '.join(words)}."]
+
+
+_RANGE = "params.lidar.range_sigma"
+_ROUGHNESS_M = 0.025
+"""Standard deviation of a surface from the plane of its voxel, m, which neighbouring returns do not show."""
+_FEWEST_RESIDUALS = 1000
+
+
+def with_range_noise(settings: Settings, scans: Iterable[LidarScan]) -> tuple[Settings, list[str]]:
+    """Return settings with the noise of the ranges as neighbouring returns show it, and a note on it.
+
+    The noise is found where ranges of a ring scatter about planes; see
+    :func:`lio_jax.lidar.range_scatter.range_scatter`. The roughness of surfaces is added, since points are
+    matched with planes of voxels. What was given stays, and so does the recipe's own value where the scatter
+    is larger, as in foliage, and where rings are unknown.
+
+    Args:
+        settings: settings of a run.
+        scans: scans of the recording; the first ones with rings decide.
+    """
+    recipe, lidar = recipe_named(settings.recipe), settings.params().lidar
+    uses_imu = isinstance(settings.config, InertialConfig) and settings.config.imu.use
+    if not recipe.noise_from_recording or not uses_imu or _RANGE in settings.given:
+        return settings, []
+    with_rings = (scan for scan in islice(scans, _SCANS_WITH_RINGS) if (scan.ring >= 0).any())
+    inputs = [padded(scan, None, settings.config.lidar) for scan in with_rings]
+    found = scattered_range_noise(inputs, lidar, _FEWEST_RESIDUALS)
+    own = settings.values["lidar"]["range_sigma"]
+    if found is None or np.hypot(found, _ROUGHNESS_M) >= own:
+        return settings, []
+    value = float(f"{np.hypot(found, _ROUGHNESS_M):.3g}")
+    settings = settings.with_value(_RANGE, value, "the scatter of neighbouring returns")
+    parts = f"noise of the ranges {found:.3g} m, with {_ROUGHNESS_M:g} m of surfaces"
+    return settings, [f"{parts}: lidar.range_sigma {value:g} m."]
 
 
 _LINE_STEP = 0.1

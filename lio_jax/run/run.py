@@ -20,6 +20,7 @@ from lio_jax.run.fitted_settings import (
     notes_on_rings,
     with_inertial_noise,
     with_point_order,
+    with_range_noise,
     with_sensor_sizes,
 )
 from lio_jax.run.folder import environment, write_json
@@ -41,6 +42,7 @@ def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list
     settings, calibration = _calibrated(sequence, settings)
     settings, fitted = fitted_to_surroundings(sequence, settings)
     settings, noise = with_inertial_noise(sequence, settings)
+    settings, ranges = with_range_noise(settings, sequence.scans())
     settings, order = with_point_order(settings, sequence.scans())
     settings, sizes = with_sensor_sizes(settings, sequence.scans())
     rings = notes_on_rings(settings, sequence.scans())
@@ -48,7 +50,7 @@ def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list
         f"config.data.{name} has no effect on a recording of the format {sequence.info.format}; leave it out."
         for name in without_effect(sequence.info.format, settings.run.data)
     ]
-    return settings, [calibration, *fitted, *noise, *order, *sizes, *rings, *unused]
+    return settings, [calibration, *fitted, *noise, *ranges, *order, *sizes, *rings, *unused]
 
 
 def _calibrated(sequence: Sequence, settings: Settings) -> tuple[Settings, str]:

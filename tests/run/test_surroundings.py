@@ -6,11 +6,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lio_jax.data.sequence import ImuData
+from lio_jax.data.sequence import ImuData, LidarScan
 from lio_jax.recipes import RECIPES
 from lio_jax.recipes.default import Default
-from lio_jax.run.fitted_settings import fitted_to_surroundings, with_inertial_noise
+from lio_jax.run.fitted_settings import (
+    fitted_to_surroundings,
+    with_inertial_noise,
+    with_range_noise,
+)
 from lio_jax.settings.settings import Settings, recipe_settings, with_overrides
+from lio_jax.sim.lidar import spinning_lidar
+from lio_jax.sim.sequence import SimulatedSequence
 from tests.run.small_drive import Replay, moving
 
 
@@ -143,3 +149,35 @@ def test_samples_without_noise_are_not_believed():
     settings, _ = with_inertial_noise(shaken(0.0, 0.0), Settings())
     own = Settings().values["imu"]["gyro_noise"]
     assert settings.values["imu"]["gyro_noise"] == pytest.approx(own / 30, rel=1e-2)
+
+
+def street(range_sigma: float) -> list[LidarScan]:
+    """Return scans of a street by a sensor with this noise of its ranges."""
+    lidar = spinning_lidar(16, 512, range_sigma=range_sigma)
+    return list(SimulatedSequence("street", lidar, duration_s=0.5, seed=3).scans())
+
+
+@pytest.mark.parametrize("sigma", [0.005, 0.02])
+def test_the_noise_of_the_ranges_is_that_of_the_scans_and_of_the_surfaces(sigma):
+    settings, notes = with_range_noise(Settings(), street(sigma))
+    found = np.sqrt(settings.values["lidar"]["range_sigma"] ** 2 - 0.025**2)
+    assert found == pytest.approx(sigma, rel=0.15)
+    assert "lidar.range_sigma" in notes[0]
+
+
+def test_the_noise_of_the_ranges_stays_where_it_is_given_or_large_or_unknown_or_without_inertial_samples():
+    scans = street(0.02)
+    for sets in (["params.lidar.range_sigma=0.03"], ["config.imu.use=false"]):
+        given = with_overrides(Settings(), sets)
+        assert with_range_noise(given, scans) == (given, [])
+    no_rings = [replace(scan, ring=np.full_like(scan.ring, -1)) for scan in scans]
+    for others in (street(0.06), no_rings, scans[:0]):
+        assert with_range_noise(Settings(), others) == (Settings(), [])
+    assert with_range_noise(recipe_settings("fast_lio2"), scans) == (recipe_settings("fast_lio2"), [])
+
+
+def test_a_given_least_width_leaves_the_voxels_to_the_surroundings():
+    given = with_overrides(Settings(), ["params.registration.least_width=0.1"])
+    settings, _ = fitted_to_surroundings(Seeing(around(2.0)), given)
+    assert settings.values["map"]["voxel_size"] == Default.near_values["params.map.voxel_size"]
+    assert settings.values["registration"]["least_width"] == 0.1
