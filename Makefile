@@ -45,7 +45,6 @@ docs-notebooks: $(VENV)/.installed-dev
 
 # The pictures of the pages, made anew by the simulator.
 figures: $(VENV)/.installed-dev
-	$(BIN)/python docs/figures/frames.py
 	$(BIN)/python docs/figures/symptoms.py
 
 $(BIN)/python:

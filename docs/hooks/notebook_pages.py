@@ -1,7 +1,7 @@
 """Show the notebooks as pages of the site.
 
-A notebook lies in the repository without outputs. Its page shows the text and the code; the pictures and printed
-lines join them where ``make docs-notebooks`` has left an executed copy in ``out/notebooks``.
+A notebook lies in the repository without outputs. Its page shows the text and the code. The pictures and
+printed lines are shown too where ``make docs-notebooks`` has left an executed copy in ``out/notebooks``.
 """
 
 import base64
