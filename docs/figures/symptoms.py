@@ -1,8 +1,9 @@
 """Draw the pictures of docs/symptoms.md: each fault is put into a simulated drive on purpose.
 
-``python docs/figures/symptoms.py`` writes four PNG files beside itself and prints the errors.
+``python docs/figures/symptoms.py`` writes five PNG files beside itself and prints the errors.
 """
 
+import sys
 import tempfile
 from pathlib import Path
 
@@ -53,22 +54,24 @@ def way(positions: np.ndarray) -> np.ndarray:
 
 
 def save(figure: plt.Figure, name: str) -> None:
-    figure.savefig(HERE / f"{name}.png", dpi=110)
+    figure.savefig(HERE / f"{name}.png", dpi=110, bbox_inches="tight")
     plt.close(figure)
 
 
-def double_walls(drive: SimulatedSequence, good: RunResult) -> None:
-    bad = run(drive, "params.extrinsics.time_offset=0.1")
-    middle = good.trajectory.positions.mean(axis=0)
-    figure, panels = plt.subplots(1, 2, figsize=(9, 4.4), sharex=True, sharey=True, layout="constrained")
-    for axes, result, title in zip(panels, (good, bad), ("right clock", "clock 0.1 s off"), strict=True):
+def double_walls() -> None:
+    drive = SimulatedSequence("office", duration_s=6.0, imu=ImuModel(), swing_rate=4.0, **SMALL)
+    figure, panels = plt.subplots(1, 2, figsize=(9, 4.6), sharex=True, sharey=True, layout="constrained")
+    for axes, seconds in zip(panels, (0.0, 0.1), strict=True):
+        result = run(drive, f"params.extrinsics.time_offset={seconds}", "params.map.point_spacing=0.1")
         points = result.map_points
-        upright = points[(points[:, 2] > 0.0) & (points[:, 2] < 3.0)]
-        axes.plot(*upright[:, :2].T, ".", markersize=1.5, color="0.25")
+        upright = points[(points[:, 2] > -0.8) & (points[:, 2] < 0.8)]
+        axes.plot(*upright[:, :2].T, ".", markersize=1.2, color="0.25")
+        axes.plot(*in_run_frame(drive, result)[:, :2].T, "--", color="tab:blue", linewidth=2, label="truth")
         axes.plot(*result.trajectory.positions[:, :2].T, color="tab:orange", linewidth=2, label="estimate")
-        axes.plot(*in_run_frame(drive, result)[:, :2].T, "--", color="tab:blue", linewidth=1, label="truth")
-        axes.set(title=title, xlabel="x [m]", aspect="equal")
-        axes.set(xlim=(middle[0] - 25, middle[0] + 25), ylim=(middle[1] - 22, middle[1] + 22))
+        axes.set(
+            title="right clock" if not seconds else f"clock {seconds} s off", xlabel="x [m]", aspect="equal"
+        )
+        axes.set(xlim=(-9, 9), ylim=(-9, 9))
     panels[0].set_ylabel("y [m]")
     panels[0].legend(loc="lower left")
     save(figure, "double_walls")
@@ -89,7 +92,7 @@ def drift_in_z() -> None:
 
 
 def lost_in_turns() -> None:
-    drive = SimulatedSequence("office", duration_s=8.0, imu=ImuModel(), swing_rate=4.0, **SMALL)
+    drive = SimulatedSequence("office", duration_s=6.0, imu=ImuModel(), swing_rate=8.0, **SMALL)
     figure, axes = plt.subplots(figsize=(8, 3.4), layout="constrained")
     runs = (("with inertial samples", (), "tab:green"), ("without", (NO_IMU,), "tab:red"))
     for label, overrides, colour in runs:
@@ -97,16 +100,42 @@ def lost_in_turns() -> None:
         seconds = (result.trajectory.stamp_ns - result.trajectory.stamp_ns[0]) * 1e-9
         error = np.linalg.norm(result.trajectory.positions - in_run_frame(drive, result), axis=1)
         axes.plot(seconds, error, color=colour, label=label)
-    axes.set(xlabel="time [s]", ylabel="error of the position [m]", yscale="log", ylim=(1e-3, None))
+    axes.set(xlabel="time [s]", ylabel="error of the position [m]", yscale="log", ylim=(1e-3, 10))
     axes.legend()
     axes.grid(alpha=0.3)
     save(figure, "lost_in_turns")
 
 
+def tunnel(*, moving_start: bool) -> SimulatedSequence:
+    return SimulatedSequence(
+        "tunnel", duration_s=12.0, imu=ImuModel(), moving_start=moving_start, beams=8, columns=512
+    )
+
+
+def slow_start() -> None:
+    drive = tunnel(moving_start=True)
+    figure, axes = plt.subplots(figsize=(8, 3.4), layout="constrained")
+    true = drive.truth()
+    speed = np.linalg.norm(true.positions[-1] - true.positions[0]) / (
+        1e-9 * (true.stamp_ns[-1] - true.stamp_ns[0])
+    )
+    given = f"params.initial.velocity=[{speed:.1f},0,0]"
+    runs = (("first velocity given", (given,), "tab:green"), ("as recorded", (), "tab:red"))
+    draw_way(axes, drive, runs)
+    save(figure, "slow_start")
+
+
 def jumps() -> None:
-    drive = SimulatedSequence("tunnel", duration_s=8.0, imu=ImuModel(), **SMALL)
     figure, axes = plt.subplots(figsize=(8, 3.4), layout="constrained")
     runs = (("with inertial samples", (), "tab:green"), ("without", (NO_IMU,), "tab:red"))
+    draw_way(axes, tunnel(moving_start=False), runs)
+    save(figure, "jumps")
+
+
+def draw_way(
+    axes: plt.Axes, drive: SimulatedSequence, runs: tuple[tuple[str, tuple[str, ...], str], ...]
+) -> None:
+    """Draw the estimated way of each run, given by its label, overrides and colour, over the true way."""
     for label, overrides, colour in runs:
         result = run(drive, *overrides)
         true = way(in_run_frame(drive, result))
@@ -115,17 +144,18 @@ def jumps() -> None:
     axes.set(xlabel="true way along the tunnel [m]", ylabel="estimated way [m]")
     axes.legend()
     axes.grid(alpha=0.3)
-    save(figure, "jumps")
 
 
-def main() -> None:
+DRAWN = (double_walls, drift_in_z, lost_in_turns, slow_start, jumps)
+
+
+def main(names: list[str]) -> None:
+    """Draw the pictures that are named; without names, all of them."""
     jax.config.update("jax_enable_x64", True)
-    drive = SimulatedSequence("city", duration_s=8.0, imu=ImuModel(), standstill_s=0.5, **SMALL)
-    double_walls(drive, run(drive))
-    drift_in_z()
-    lost_in_turns()
-    jumps()
+    for draw in DRAWN:
+        if not names or draw.__name__ in names:
+            draw()
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -85,6 +85,7 @@ def _network_addresses(log: Path) -> list[str]:
 
 _SOFTWARE_GRAPHICS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 _LOOK_EVERY_S = 2.0
+_SETTLED_S = 0.15
 
 
 def seen(address: str, folder: Path, enough: Callable[[np.ndarray], bool], seconds: float) -> np.ndarray:
@@ -219,6 +220,8 @@ async def _visits(addresses: list[str], port_file: Path, width: int, until: floa
             page.events.clear()
             await page.ask("Page.navigate", url=address)
             await page.until("Page.loadEventFired")
+            # what the page's scripts do after it was loaded counts too
+            await asyncio.sleep(_SETTLED_S)
             size = await page.ask(
                 "Runtime.evaluate", expression="document.documentElement.scrollWidth", returnByValue=True
             )
