@@ -119,8 +119,8 @@ def slow_start() -> None:
     speed = np.linalg.norm(true.positions[-1] - true.positions[0]) / (
         1e-9 * (true.stamp_ns[-1] - true.stamp_ns[0])
     )
-    given = f"params.initial.velocity=[{speed:.1f},0,0]"
-    runs = (("first velocity given", (given,), "tab:green"), ("as recorded", (), "tab:red"))
+    given = (f"params.initial.velocity=[{speed:.1f},0,0]", "params.initial.velocity_sigma=0.1")
+    runs = (("first velocity given", given, "tab:green"), ("as recorded", (), "tab:red"))
     draw_way(axes, drive, runs)
     save(figure, "slow_start")
 
