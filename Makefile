@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test test-all test-long lint bench fuzz settings clean
+.PHONY: demo test test-all test-long lint bench fuzz settings docs docs-notebooks figures clean
 
 demo: $(VENV)/.installed
 	$(BIN)/lio-jax demo --out out/demo --overwrite
@@ -36,6 +36,17 @@ SEED ?= 0
 fuzz: $(VENV)/.installed-dev
 	$(BIN)/python -m experiments.fuzz --inputs $(N) --seed $(SEED)
 
+# The site, in site/index.html. With executed notebooks in out/notebooks their pictures are on the pages.
+docs: $(VENV)/.installed-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+docs-notebooks: $(VENV)/.installed-dev
+	$(BIN)/python docs/hooks/execute_notebooks.py notebooks out/notebooks
+
+# The pictures of the pages, made anew by the simulator.
+figures: $(VENV)/.installed-dev
+	$(BIN)/python docs/figures/symptoms.py
+
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
@@ -55,4 +66,4 @@ settings: $(VENV)/.installed
 	$(BIN)/python -m lio_jax.settings.generate configs/recipes docs/settings.md
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) build dist site *.egg-info

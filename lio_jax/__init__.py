@@ -5,6 +5,14 @@ global setting of JAX. Turn on double precision first where you want the command
 ``jax.config.update("jax_enable_x64", True)``.
 """
 
+from importlib.metadata import version
+from typing import Any
+
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_loaded, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name on first use; ``__version__`` is the installed distribution's."""
+    return version("lio-jax") if name == "__version__" else _loaded(name)

@@ -63,3 +63,5 @@ from .tuning.optimise import fisher_scoring as fisher_scoring
 from .tuning.optimise import stationary as stationary
 from .tuning.parameters import free_parameters as free_parameters
 from .tuning.recording import Recording as Recording
+
+__version__: str
