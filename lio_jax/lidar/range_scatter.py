@@ -90,17 +90,21 @@ def scattered_range_noise(scans: Iterable[Scan], lidar: LidarParams, fewest: int
     The median does not follow edges between neighbours, unless they are as many as the planes.
 
     Args:
-        scans: padded sweeps.
+        scans: padded sweeps; the first ones that together have ``fewest`` residuals are read, no more.
         lidar: bounds of the ranges, and the noise of the beams' directions where it is known.
         fewest: number of residuals below which nothing is said.
 
     Returns:
         the noise; None for too few residuals.
     """
-    found = [jax.device_get(_scatter_of(scan, lidar)) for scan in scans]
-    parts = [[getattr(one, name)[one.valid] for one in found] for name in ("deviation", "spread", "slope")]
-    if sum(map(len, parts[0])) < fewest:
+    found: list[RangeScatter] = []
+    for scan in scans:
+        found.append(jax.device_get(_scatter_of(scan, lidar)))
+        if sum(int(one.valid.sum()) for one in found) >= fewest:
+            break
+    else:
         return None
+    parts = [[getattr(one, name)[one.valid] for one in found] for name in ("deviation", "spread", "slope")]
     deviation, spread, slope = (np.concatenate(part).astype(np.float64) for part in parts)
     angle = float(lidar.angle_sigma) if isinstance(lidar, BeamParams) else 0.0
 

@@ -21,7 +21,8 @@ class InertialMatch(eqx.Module):
     matched: the prediction needs fewer points to correct it."""
     least_width: Scalar = leaf(0.18, "m", least=0)
     """With inertial samples, a voxel whose second largest standard deviation is smaller acts as a scan line,
-    which defines no plane; a wider one acts as if it were as much narrower."""
+    which defines no plane; a wider one acts as if it were as much narrower. Where that leaves less than a
+    third of the matches, the width is halved, three times at most, and then zero."""
 
 
 class VoxelMatch(GaussNewtonMatch, RobustFilterMatch, ThinnedMatch, InertialMatch):

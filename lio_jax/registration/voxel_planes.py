@@ -328,6 +328,24 @@ def _log_or_zero(squares: Float[Array, " k"]) -> Float[Array, " k"]:
     return jnp.where(positive, jnp.log(jnp.where(positive, squares, 1.0)), 0.0)
 
 
+_WIDE_SHARE = 1 / 3
+"""Share of the matches that stay wide, at least; see :func:`least_variance`."""
+_HALVINGS = 3
+
+
+def least_variance(found: Matches, least: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the variance across which a voxel is narrow, m^2: the given one, or less in a sparse map.
+
+    A few beams, or small voxels, leave no voxel as wide as that. Without any plane the first unknown velocity
+    stays unknown, and the estimate runs away. The width is halved until it leaves enough matches, and is zero
+    if three halvings do not.
+    """
+    ladder = least * 0.25 ** jnp.arange(_HALVINGS + 1, dtype=least.dtype)
+    wide = found.used & (found.variances[:, 1] > ladder[:, None])
+    enough = jnp.sum(wide, -1) >= _WIDE_SHARE * jnp.sum(found.used)
+    return jnp.max(jnp.where(enough, ladder, 0.0))
+
+
 class ScanToVoxels(ScanMatch[Array, Matches]):
     """A scan against the planes of a voxel map.
 
@@ -347,7 +365,7 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
     lidar: BeamParams
     least_width: Float[Array, ""] | float = 0.0
     """Standard deviation across a voxel below which its points define no plane, m; 0: scan lines count as
-    planes. They should not where inertial samples predict the pose."""
+    planes. They should not where inertial samples predict the pose. It is less where few voxels are wide."""
 
     def together(self, points: Float[Array, "k 3"]) -> tuple[Float[Array, "k 3"], Bool[Array, " k"]]:
         return points, self.mask
@@ -360,8 +378,8 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
         return self._by_width(found)
 
     def _by_width(self, found: Matches) -> Matches:
-        least = jax.lax.stop_gradient(jnp.asarray(self.least_width**2, found.variances.dtype))
-        return replace(found, least_variance=least)
+        least = jnp.asarray(self.least_width**2, found.variances.dtype)
+        return replace(found, least_variance=jax.lax.stop_gradient(least_variance(found, least)))
 
     def linearise(
         self, T_world_lidar: jaxlie.SE3, found: Matches, iteration: Int32[Array, ""]

@@ -115,14 +115,15 @@ def with_range_noise(settings: Settings, scans: Iterable[LidarScan]) -> tuple[Se
 
     Args:
         settings: settings of a run.
-        scans: scans of the recording; the first ones with rings decide.
+        scans: scans of the recording; the first ones with rings decide, mostly the first one alone.
     """
     recipe, lidar = recipe_named(settings.recipe), settings.params().lidar
     uses_imu = isinstance(settings.config, InertialConfig) and settings.config.imu.use
     if not recipe.noise_from_recording or not uses_imu or _RANGE in settings.given:
         return settings, []
     with_rings = (scan for scan in islice(scans, _SCANS_WITH_RINGS) if (scan.ring >= 0).any())
-    inputs = [padded(scan, None, settings.config.lidar) for scan in with_rings]
+    # one by one: a recording that breaks off early is read no further than needed
+    inputs = (padded(scan, None, settings.config.lidar) for scan in with_rings)
     found = scattered_range_noise(inputs, lidar, _FEWEST_RESIDUALS)
     own = settings.values["lidar"]["range_sigma"]
     if found is None or np.hypot(found, _ROUGHNESS_M) >= own:

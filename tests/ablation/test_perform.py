@@ -98,6 +98,8 @@ def test_a_batch_leaves_what_the_runs_one_by_one_leave(tmp_path):
     for name in COLUMNS:
         ours, theirs = (np.array(one[name].to_pylist(), float) for one in tables)
         np.testing.assert_allclose(ours, theirs, atol=_SINGLE_M, rtol=1e-3, err_msg=name)
+    # eight beams leave few planes, and the drive is not lost; measured: 0.013 m
+    assert max(tables[0]["ate.rmse"].to_pylist()) < 0.05
 
 
 _SINGLE_M = 100.0 * 2**-23

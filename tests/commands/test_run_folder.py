@@ -9,7 +9,7 @@ from pypcd4 import PointCloud
 from scipy.spatial.transform import Rotation
 
 from lio_jax.settings.settings import load_settings
-from tests.commands.conftest import PLAIN
+from tests.commands.conftest import NOTES, PLAIN
 from tests.run.small_drive import COUNT, drive, moving
 
 FILES = {
@@ -242,4 +242,4 @@ def test_report_on_standard_output(folder, cli, tmp_path):
     assert f"scans      {COUNT}  (" in done.out
     assert "ATE translation" in done.out
     assert f"results    {tmp_path / 'out'}" in done.out
-    assert done.err == "note: T_imu_lidar: from the recording's calibration.\n"
+    assert done.err == NOTES

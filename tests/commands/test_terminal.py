@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from lio_jax.commands.runtime import prepare_jax
-from tests.commands.conftest import PLAIN
+from tests.commands.conftest import NOTES, PLAIN
 
 
 def _shell(*words):
@@ -17,7 +17,7 @@ def _shell(*words):
 def test_run_is_quiet_when_piped(folder, tmp_path):
     done = _shell("run", folder, "--scans", 3, *PLAIN, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
-    assert done.stderr == "note: T_imu_lidar: from the recording's calibration.\n"
+    assert done.stderr == NOTES
     assert done.stdout.startswith("scans      3  (")
     assert "\r" not in done.stdout + done.stderr
 

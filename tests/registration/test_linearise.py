@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.voxel_map import anchor_of, empty_map, insert
 from lio_jax.registration.scan_match import NormalEquations, relative_blur
-from lio_jax.registration.voxel_planes import associate, linearise, point_noise
+from lio_jax.registration.voxel_planes import associate, least_variance, linearise, no_matches, point_noise
 from tests.registration.scenes import map_of, matrix, params_with, pose
 
 VOXEL, SIGMA = 1.2, 0.05
@@ -219,6 +219,31 @@ def test_a_voxel_acts_as_narrower_by_the_least_width_and_a_narrow_one_is_no_plan
     lines = [number for number, value in enumerate(expected) if value < 1e-9]
     assert bool(lines) == (width > 0)
     assert len(lines) < len(expected)
+
+
+def given_variances(wide):
+    """Return matches in voxels with these second largest standard deviations, m; the last one is not used."""
+    wide = jnp.asarray(wide, jnp.float32)
+    found = no_matches(jnp.ones(len(wide), bool), jnp.float32)
+    used = jnp.arange(len(wide)) < len(wide) - 1
+    return replace(found, variances=jnp.stack([jnp.zeros_like(wide), wide**2], -1), used=used)
+
+
+@pytest.mark.parametrize(
+    ("wide", "expected"),
+    [
+        # a third of the used ones is as wide
+        ([0.3, 0.1, 0.1, 0.3], 0.2),
+        ([0.19, 0.05, 0.11, 0.3], 0.1),
+        ([0.04, 0.03, 0.02, 0.3], 0.025),
+        ([0.02, 0.01, 0.01, 0.3], 0.0),
+        # nothing is matched
+        ([0.3], 0.2),
+    ],
+)
+def test_the_least_width_is_halved_until_a_third_of_the_matches_is_wide(wide, expected):
+    found = least_variance(given_variances(wide), jnp.float32(0.2**2))
+    np.testing.assert_allclose(np.sqrt(found), expected, rtol=1e-6)
 
 
 def blur(points, patch, T) -> float:

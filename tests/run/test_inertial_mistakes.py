@@ -203,6 +203,7 @@ def test_five_seconds_without_lidar_are_predicted_and_recovered_from(replayed: R
     seen = replayed([*scans(), *(between if empty else []), *scans(RETURN, RETURN + 4)], imu())
     back = len(seen.tracked) - 4
     if empty:
+        assert seen.sigma[back] < 0.1 * seen.sigma[back - 1]
         assert set(seen.failures) == set(range(END - START, back))
         assert set(seen.failures.values()) == {"it holds no points; the pose is the prediction."}
         outage = seen.sigma[END - START : back]
@@ -214,8 +215,8 @@ def test_five_seconds_without_lidar_are_predicted_and_recovered_from(replayed: R
             back: "no scan came for 5.10 s before it: inertial samples predicted the motion."
         }
     assert seen.errors[back:].max() < 0.05
-    # little of what the vehicle sees now is in the map, so both are larger than before
-    assert seen.sigma[back:].max() < 0.05
+    # little of what the vehicle sees now is in the map: few planes correct the prediction; measured: 4.3 times
+    assert seen.sigma[back:].max() < 5 * seen.sigma[END - START - 1]
     assert np.all(seen.errors[back:] < 3 * seen.sigma[back:])
 
 
