@@ -215,7 +215,7 @@ def test_five_seconds_without_lidar_are_predicted_and_recovered_from(replayed: R
             back: "no scan came for 5.10 s before it: inertial samples predicted the motion."
         }
     assert seen.errors[back:].max() < 0.05
-    # little of what the vehicle sees now is in the map: few planes correct the prediction; measured: 4.3 times
+    # the map holds little of what the vehicle sees now, so few planes correct the prediction; measured: 4.3
     assert seen.sigma[back:].max() < 5 * seen.sigma[END - START - 1]
     assert np.all(seen.errors[back:] < 3 * seen.sigma[back:])
 
