@@ -24,10 +24,12 @@ from lio_jax.data.bag_files import (
     until_damage,
     why,
 )
-from lio_jax.data.bag_scans import decode_cloud, recognise_scans
+from lio_jax.data.cloud_fields import RawCloud
 from lio_jax.data.config import DataConfig
 from lio_jax.data.imu_checks import accel_scale
 from lio_jax.data.navigation_messages import GpsCollector, ImuCollector
+from lio_jax.data.pointcloud2 import decode_cloud
+from lio_jax.data.scan_reading import ScanReading, recognise_clouds
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog, entries
 from lio_jax.data.static_transforms import frame_name, gathered, transform_between
 from lio_jax.data.time_order import Stamped, in_time_order
@@ -67,8 +69,7 @@ class RosbagSequence:
             self._lidar = self._choose_lidar(topics)
             self._imu_topic = self._choose("imu_topic", config.imu_topic, topics, _IMU_TYPES)
             self._gps_topic = self._choose_gps(topics)
-            messages = until_damage(self._messages(reader, self._lidar), lambda reason: None)
-            self._reading = recognise_scans(reader, self._lidar, messages, config, self._where)
+            self._reading = self._recognised(reader)
             self._T_imu_lidar = self._extrinsic(reader, topics)
         self._notes.extend(self._reading.notes)
 
@@ -188,6 +189,28 @@ class RosbagSequence:
                 f"{self._path}: topic {lidar.name} holds no messages; record or choose another."
             )
         return lidar
+
+    def _recognised(self, reader: "AnyReader") -> ScanReading:
+        """Settle from the topic's first clouds with points how its clouds are read."""
+        reason = ""
+
+        def decoded() -> Iterator[tuple[RawCloud, int]]:
+            nonlocal reason
+            messages = until_damage(self._messages(reader, self._lidar), lambda reason: None)
+            for _, received_ns, raw in messages:
+                try:
+                    cloud = decode_cloud(reader, self._lidar, raw, self._config.time_field, self._where)
+                except ValueError as error:
+                    reason = f" ({error})"
+                    continue
+                yield cloud, received_ns
+
+        reading = recognise_clouds(decoded(), self._config, self._where)
+        if reading is None:
+            raise LioJaxError(
+                f"{self._where}: no point cloud can be read{reason}; the recording is empty or damaged there."
+            )
+        return reading
 
     def _extrinsic(self, reader: "AnyReader", topics: tuple[Topic, ...]) -> NDArray[np.float64] | None:
         """Return the lidar's pose in the IMU frame if the bag's static transforms state it."""
