@@ -148,19 +148,22 @@ def run(
 @app.command(name="eval")
 def evaluate(
     estimate: Positional[Annotated[Path, arg(metavar="ESTIMATE")]],
-    reference: Positional[Annotated[Path, arg(metavar="REFERENCE")]],
+    reference: Positional[Annotated[Path | None, arg(metavar="REFERENCE")]] = None,
+    gps: Annotated[Path | None, arg(metavar="DATA")] = None,
+    set_: Assignments = (),
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> None:
-    """Compare a trajectory with a reference: ATE, RPE, KITTI segment errors.
+    """Compare a trajectory with a reference (ATE, RPE, KITTI segment errors), or with GPS fixes.
 
     Args:
         estimate: Run folder, TUM file or KITTI poses.
         reference: Run folder, TUM file or KITTI poses, or a recording that holds ground truth.
+        gps: Recording whose GPS fixes are compared with instead, by the settings of the run.
         json: Print one JSON object instead of a table.
     """
     from lio_jax.commands.show import evaluate as command
 
-    command(estimate, reference, json)
+    command(estimate, reference, gps, set_, json)
 
 
 @app.command(name="report")
