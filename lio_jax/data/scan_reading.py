@@ -85,6 +85,7 @@ def recognise_clouds(
         UsageError: the settings name a number of beams that the points do not fit.
     """
     first: RawCloud | None = None
+    sectors: list[frozenset[int]] = []
     headers: list[int] = []
     samples: list[TimeSample] = []
     beams: list[int] = []
@@ -95,6 +96,7 @@ def recognise_clouds(
         if not len(cloud.points):
             continue
         headers.append(cloud.stamp_ns)
+        sectors.append(_sectors(cloud.points))
         if cloud.ring is None:
             beams.append(config.beams or guess_beams(cloud.points))
         low, high = cloud.time_range or (0, 0)
@@ -106,7 +108,7 @@ def recognise_clouds(
     if first is None:
         return None
     chosen_beams = max(set(beams), key=beams.count) if beams else config.beams or 16
-    ring_note = _ring_note(first, chosen_beams, config.beams > 0, where)
+    ring_note = (*_ring_note(first, chosen_beams, config.beams > 0, where), *_parts_note(sectors))
     if config.compensated == "yes":
         time_note = "points are taken as motion compensated to the header stamp (config.data.compensated)"
         return ScanReading(None, "start", 0.0, chosen_beams, (time_note, *ring_note))
@@ -118,6 +120,30 @@ def recognise_clouds(
     missing = f"field {first.time_field!r} holds a single value" if first.time_field else "not recorded"
     time_note = f"per-point time: {missing}, reconstructed from azimuth over {period:.4g} s a scan, {note}"
     return ScanReading(None, stamp_at, period, chosen_beams, (time_note, *ring_note))
+
+
+_SECTORS = 36
+
+
+def _sectors(points: NDArray[np.float32]) -> frozenset[int]:
+    """Return the sectors of 10 deg of azimuth that hold points."""
+    turned = np.arctan2(points[:, 1], points[:, 0])
+    return frozenset(np.unique(((turned / (2 * np.pi)) % 1.0 * _SECTORS).astype(int)).tolist())
+
+
+def _parts_note(sectors: list[frozenset[int]]) -> tuple[str, ...]:
+    """Return a sentence if clouds that follow each other see different sectors, as parts of a sweep do."""
+    largest = max(map(len, sectors), default=0)
+    if len(sectors) < 3 or largest > 0.6 * _SECTORS:
+        return ()
+    # a sensor with a narrow view sees the same sectors in each cloud
+    if len(frozenset().union(*sectors)) < 1.5 * largest:
+        return ()
+    sentence = (
+        f"each cloud holds a part of a sweep only (at most {10 * largest} deg of azimuth) and is read as a "
+        "scan of its own; let the driver publish whole sweeps"
+    )
+    return (sentence,)
 
 
 def _ring_note(cloud: RawCloud, beams: int, given: bool, where: str) -> tuple[str, ...]:
