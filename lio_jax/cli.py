@@ -97,7 +97,7 @@ def inspect(
     """Show a recording's contents, its faults, and the settings that fit it.
 
     Args:
-        data: Recording: KITTI folder, ROS bag or native folder.
+        data: Recording: KITTI folder, ROS bag, folder of clouds or native folder.
         json: Print one JSON object instead of a table.
         write_config: Write the settings that fit, for --recipe of lio-jax run.
         overwrite: Replace an existing file.
@@ -126,7 +126,7 @@ def run(
     """Estimate trajectory and map of a recording.
 
     Args:
-        data: Recording: KITTI odometry sequence or raw drive, ROS 1 or ROS 2 bag, native folder.
+        data: Recording: KITTI odometry sequence or raw drive, ROS bag, folder of clouds, native folder.
         out: Folder for the results.
         recipe: Recipe or settings file; a run's config.yaml repeats that run. None means default, or with
             --params-from the recipe that follows that system.
@@ -148,19 +148,22 @@ def run(
 @app.command(name="eval")
 def evaluate(
     estimate: Positional[Annotated[Path, arg(metavar="ESTIMATE")]],
-    reference: Positional[Annotated[Path, arg(metavar="REFERENCE")]],
+    reference: Positional[Annotated[Path | None, arg(metavar="REFERENCE")]] = None,
+    gps: Annotated[Path | None, arg(metavar="DATA")] = None,
+    set_: Assignments = (),
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> None:
-    """Compare a trajectory with a reference: ATE, RPE, KITTI segment errors.
+    """Compare a trajectory with a reference (ATE, RPE, KITTI segment errors), or with GPS fixes.
 
     Args:
         estimate: Run folder, TUM file or KITTI poses.
         reference: Run folder, TUM file or KITTI poses, or a recording that holds ground truth.
+        gps: Recording whose GPS fixes are compared with instead, by the settings of the run.
         json: Print one JSON object instead of a table.
     """
     from lio_jax.commands.show import evaluate as command
 
-    command(estimate, reference, json)
+    command(estimate, reference, gps, set_, json)
 
 
 @app.command(name="report")
@@ -209,7 +212,7 @@ def export(
     """Write a recording in another format: ROS bag, KITTI odometry sequence or native folder.
 
     Args:
-        data: Recording: KITTI folder, ROS bag or native folder.
+        data: Recording: KITTI folder, ROS bag, folder of clouds or native folder.
         to: Output format.
         out: Output: *.bag (ROS 1), *.mcap or *.db3 (ROS 2); else a folder.
         layout: Make of the LiDAR whose messages a bag gets: velodyne, ouster or livox.

@@ -8,15 +8,36 @@ from lio_jax.core.errors import UsageError
 from lio_jax.core.files import atomic_path
 from lio_jax.data.detect import open_sequence
 from lio_jax.evaluation.evaluate import evaluate_files, format_evaluation
+from lio_jax.evaluation.gps_error import evaluate_gps_files, format_gps_evaluation
 from lio_jax.inspection import format_inspection, inspect_sequence, settings_text
-from lio_jax.settings.settings import Settings, with_overrides
+from lio_jax.settings.settings import Settings, load_settings, with_overrides
 from lio_jax.viz.viewer import served, show
 
 
-def evaluate(estimate: Path, reference: Path, as_json: bool) -> None:
-    """Print the errors as a table, or as one JSON object."""
+def evaluate(
+    estimate: Path, reference: Path | None, gps: Path | None, assignments: tuple[str, ...], as_json: bool
+) -> None:
+    """Print the errors against a reference or against GPS fixes as a table, or as one JSON object."""
+    if (reference is None) == (gps is None):
+        raise UsageError("eval: needs either REFERENCE or --gps DATA; --help explains the command.")
+    if gps is not None:
+        _evaluate_gps(estimate, gps, assignments, as_json)
+        return
+    if assignments:
+        raise UsageError("eval: --set has an effect with --gps only; leave it out.")
+    assert reference is not None
     evaluation = evaluate_files(estimate, reference)
     print(json.dumps(evaluation.as_dict(), allow_nan=False) if as_json else format_evaluation(evaluation))
+
+
+def _evaluate_gps(estimate: Path, gps: Path, assignments: tuple[str, ...], as_json: bool) -> None:
+    is_odometry = estimate.name == "odometry.tum"
+    resolved = (estimate.parent if is_odometry else estimate) / "config.yaml"
+    of_run = load_settings(resolved) if resolved.is_file() else Settings()
+    settings = with_overrides(of_run, assignments)
+    corrected = of_run.run.backend.gps and not is_odometry
+    found = evaluate_gps_files(estimate, gps, settings, used_by_run=corrected)
+    print(json.dumps(found.as_dict(), allow_nan=False) if as_json else format_gps_evaluation(found))
 
 
 def inspect(

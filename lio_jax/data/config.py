@@ -27,6 +27,8 @@ class DataConfig:
     """Which end of the scan the message's header stamp marks."""
     accel_unit: Literal["auto", "m/s^2", "g"] = static("auto")
     """Unit of the accelerometer."""
+    length_unit: Literal["auto", "m", "mm"] = static("auto")
+    """Unit of the points in a folder of clouds."""
     compensated: Literal["auto", "yes", "no"] = static("auto")
     """Whether the recording's points are already motion compensated (KITTI odometry: yes)."""
     vertical_correction_deg: float = static(0.205, "deg")
@@ -34,6 +36,7 @@ class DataConfig:
     beams: int = static(0, least=0)
     """Beams for ring reconstruction where the recording holds no ring; 0: 16, 32 or 64 by the data."""
     scan_period: float = static(0.1, "s", above=0)
-    """Duration of one sweep where it cannot be read from the data."""
+    """Duration of one sweep, and the time between scans that have no stamps, where it cannot be read from the
+    data."""
     prefetch: int = static(3, least=0)
     """Number of scans decoded and padded ahead on a thread."""

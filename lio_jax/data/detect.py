@@ -4,11 +4,11 @@ from dataclasses import fields
 from pathlib import Path
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data import kitti, kitti_raw, native, rosbag
+from lio_jax.data import clouds, kitti, kitti_raw, native, rosbag
 from lio_jax.data.config import DataConfig
 from lio_jax.data.sequence import Reader, Sequence, entries
 
-READERS = (kitti.READER, kitti_raw.READER, native.READER, rosbag.READER)
+READERS = (kitti.READER, kitti_raw.READER, native.READER, rosbag.READER, clouds.READER)
 """All readers; the first one that recognises a path opens it. A new format is a module and an entry here."""
 
 _BY_THE_RUN = {"prefetch"}
@@ -21,8 +21,8 @@ def open_sequence(path: Path | str, config: DataConfig | None = None) -> Sequenc
     """Open the recording at ``path`` with the reader that fits its layout.
 
     Args:
-        path: a KITTI odometry sequence folder, a KITTI raw drive folder, a ROS 1 or ROS 2 bag, or a native
-            folder.
+        path: a KITTI odometry sequence folder, a KITTI raw drive folder, a ROS 1 or ROS 2 bag, a native
+            folder, or a folder of clouds.
         config: how the recording is read; None: the defaults, which recognise everything from the data.
 
     Raises:

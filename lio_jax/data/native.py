@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import array_of, parse_yaml, read_arrays, read_text
+from lio_jax.data.cloud_fields import valid_returns
 from lio_jax.data.config import DataConfig
-from lio_jax.data.pointcloud2 import valid_returns
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
 from lio_jax.data.time_order import Stamped, in_time_order
 from lio_jax.data.trajectory import Trajectory, are_rigid, read_tum

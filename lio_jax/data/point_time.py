@@ -109,7 +109,7 @@ def scan_period(header_ns: Sequence[int], fallback: float) -> float:
 
 
 def recognise_point_time(
-    samples: Sequence[TimeSample], field: str, kind: str, config: DataConfig
+    samples: Sequence[TimeSample], field: str, kind: str, config: DataConfig, stamped: bool = True
 ) -> PointTiming | None:
     """Settle the meaning of per-point times from the first scans; None where all times are equal.
 
@@ -118,6 +118,7 @@ def recognise_point_time(
         field: name of the time field, for the note.
         kind: its data type, for the note.
         config: overrides, and the scan period to use where there is only one scan.
+        stamped: whether the header stamps are recorded; false where scans are only counted.
     """
     period = scan_period([sample.header_ns for sample in samples], config.scan_period)
     spread = float(np.median([sample.high - sample.low for sample in samples]))
@@ -131,7 +132,7 @@ def recognise_point_time(
     unit = config.time_unit if config.time_unit != "auto" else _unit(samples, spread, period, absolute)
     tick_ns = TICK_NS[unit]
     sweep = spread * tick_ns * 1e-9
-    anchor, where = _anchor(samples, tick_ns, absolute, sweep, config)
+    anchor, where = _anchor(samples, tick_ns, absolute, sweep, config, stamped)
     note = (
         f"per-point time: field {field!r}, {kind} {unit} {'absolute' if absolute else 'relative'}, "
         f"{sweep:.4f} s a scan, {where}"
@@ -180,8 +181,15 @@ def _unit(samples: Sequence[TimeSample], spread: float, period: float, absolute:
 
 
 def _anchor(
-    samples: Sequence[TimeSample], tick_ns: int, absolute: bool, sweep: float, config: DataConfig
+    samples: Sequence[TimeSample],
+    tick_ns: int,
+    absolute: bool,
+    sweep: float,
+    config: DataConfig,
+    stamped: bool,
 ) -> tuple[Literal["points", "start", "end", "inside"], str]:
+    if absolute and not stamped:
+        return "points", "these times place the scans, instead of counted stamps"
     if config.stamp_at != "auto":
         return stamp_end(samples, sweep, config)
     if absolute:

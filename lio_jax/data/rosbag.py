@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from copy import copy
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,12 +25,14 @@ from lio_jax.data.bag_files import (
     until_damage,
     why,
 )
-from lio_jax.data.bag_scans import decode_cloud, recognise_scans
+from lio_jax.data.cloud_fields import RawCloud
 from lio_jax.data.config import DataConfig
 from lio_jax.data.imu_checks import accel_scale
 from lio_jax.data.navigation_messages import GpsCollector, ImuCollector
+from lio_jax.data.pointcloud2 import decode_cloud
+from lio_jax.data.scan_reading import ScanReading, recognise_clouds
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog, entries
-from lio_jax.data.static_transforms import frame_name, gathered, transform_between
+from lio_jax.data.static_transforms import Transforms, constant, frame_name, gathered, transform_between
 from lio_jax.data.time_order import Stamped, in_time_order
 from lio_jax.data.trajectory import Trajectory
 
@@ -40,6 +43,8 @@ _LIDAR_TYPES = dict.fromkeys((pointcloud2.TYPE, *sorted(pointcloud2.LIVOX_TYPES)
 _IMU_TYPES = {navigation_messages.TYPE: "an Imu"}
 _GPS_TYPES = {navigation_messages.FIX_TYPE: "a NavSatFix", navigation_messages.ODOMETRY_TYPE: "an Odometry"}
 _STATIC = (static_transforms.TOPIC, static_transforms.TYPE)
+_REPEATS_LOOKED_AT = 200
+"""Number of messages of /tf that are looked at in each third of a bag."""
 _GPS_NAMES = ("gps", "gnss", "rtk")
 
 
@@ -67,8 +72,7 @@ class RosbagSequence:
             self._lidar = self._choose_lidar(topics)
             self._imu_topic = self._choose("imu_topic", config.imu_topic, topics, _IMU_TYPES)
             self._gps_topic = self._choose_gps(topics)
-            messages = until_damage(self._messages(reader, self._lidar), lambda reason: None)
-            self._reading = recognise_scans(reader, self._lidar, messages, config, self._where)
+            self._reading = self._recognised(reader)
             self._T_imu_lidar = self._extrinsic(reader, topics)
         self._notes.extend(self._reading.notes)
 
@@ -189,10 +193,34 @@ class RosbagSequence:
             )
         return lidar
 
+    def _recognised(self, reader: "AnyReader") -> ScanReading:
+        """Settle from the topic's first clouds with points how its clouds are read."""
+        reason = ""
+
+        def decoded() -> Iterator[tuple[RawCloud, int]]:
+            nonlocal reason
+            messages = until_damage(self._messages(reader, self._lidar), lambda reason: None)
+            for _, received_ns, raw in messages:
+                try:
+                    cloud = decode_cloud(reader, self._lidar, raw, self._config.time_field, self._where)
+                except ValueError as error:
+                    reason = f" ({error})"
+                    continue
+                yield cloud, received_ns
+
+        reading = recognise_clouds(decoded(), self._config, self._where)
+        if reading is None:
+            raise LioJaxError(
+                f"{self._where}: no point cloud can be read{reason}; the recording is empty or damaged there."
+            )
+        return reading
+
     def _extrinsic(self, reader: "AnyReader", topics: tuple[Topic, ...]) -> NDArray[np.float64] | None:
         """Return the lidar's pose in the IMU frame if the bag's static transforms state it."""
         static = [topic for topic in topics if (topic.name, topic.type) == _STATIC]
-        if self._imu_topic is None or not static:
+        repeated = [topic for topic in topics if topic.name == static_transforms.REPEATED_TOPIC]
+        repeated = [topic for topic in repeated if topic.type in static_transforms.REPEATED_TYPES]
+        if self._imu_topic is None or not (static or repeated):
             return None
         frames = [self._frame(reader, topic) for topic in (self._imu_topic, self._lidar)]
         if None in frames or frames[0] == frames[1]:
@@ -200,22 +228,40 @@ class RosbagSequence:
             return None
         imu, lidar = map(str, frames)
 
-        def broken(reason: str) -> None:
-            self._warnings.add(f"{self._path}: {static_transforms.TOPIC} is damaged ({reason}).")
+        known: Transforms = {}
+        for topic in [*static, *repeated]:
+            known = self._transforms(reader, topic) | known
+            T_imu_lidar = transform_between(known, imu, lidar)
+            if T_imu_lidar is not None:
+                self._notes.append(f"T_imu_lidar: {topic.name} states the pose of {lidar} in {imu}")
+                return T_imu_lidar
+        looked_at = " and ".join(topic.name for topic in [*static, *repeated])
+        do = "does" if len(static) + len(repeated) == 1 else "do"
+        self._notes.append(f"T_imu_lidar: {looked_at} {do} not tie {lidar} to {imu}")
+        return None
 
-        messages = until_damage(self._messages(reader, *static), broken)
-        decoded = (reader.deserialize(raw, static_transforms.TYPE) for _, _, raw in messages)
+    def _transforms(self, reader: "AnyReader", topic: Topic) -> Transforms:
+        """Return the transforms that a topic states for the whole recording."""
+
+        def broken(reason: str) -> None:
+            self._warnings.add(f"{self._path}: {topic.name} is damaged ({reason}).")
+
+        is_static = topic.name == static_transforms.TOPIC
+        messages = self._messages(reader, topic) if is_static else self._spread(reader, topic)
+        decoded = (reader.deserialize(raw, topic.type) for _, _, raw in until_damage(messages, broken))
         try:
-            T_imu_lidar = transform_between(gathered(decoded), imu, lidar)
+            return gathered(decoded) if is_static else constant(decoded)
         # The generated decoders raise exceptions of many kinds on damaged bytes.
         except Exception as error:
             broken(why(error))
-            return None
-        if T_imu_lidar is None:
-            self._notes.append(f"T_imu_lidar: {static_transforms.TOPIC} does not tie {lidar} to {imu}")
-        else:
-            self._notes.append(f"T_imu_lidar: {static_transforms.TOPIC} states the pose of {lidar} in {imu}")
-        return T_imu_lidar
+            return {}
+
+    def _spread(self, reader: "AnyReader", topic: Topic) -> Iterator[tuple[Any, int, bytes]]:
+        """Yield messages from three parts of the bag: what stands still at first may move later."""
+        connections = [c for c in reader.connections if (c.topic, c.msgtype) == (topic.name, topic.type)]
+        for part in range(3):
+            start = reader.start_time + part * (reader.end_time - reader.start_time) // 3
+            yield from islice(reader.messages(connections, start=start), _REPEATS_LOOKED_AT)
 
     def _frame(self, reader: "AnyReader", topic: Topic) -> str | None:
         for _, _, raw in until_damage(self._messages(reader, topic), lambda reason: None):

@@ -92,7 +92,7 @@ class SequenceInfo:
     name: str
     """Short name of the recording for titles and file names."""
     format: str
-    """Reader that opened it: kitti_odometry, kitti_raw, rosbag or native."""
+    """Reader that opened it: kitti_odometry, kitti_raw, rosbag, native or clouds."""
     path: str
     scan_count: int
     T_imu_lidar: NDArray[np.float64] | None = None

@@ -1,4 +1,4 @@
-"""The extrinsic T_imu_lidar from the frames that a bag's /tf_static connects."""
+"""The extrinsic T_imu_lidar from the frames that a bag's /tf_static, or what is constant in /tf, connects."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -10,6 +10,11 @@ from scipy.spatial.transform import Rotation
 
 TOPIC = "/tf_static"
 TYPE = "tf2_msgs/msg/TFMessage"
+REPEATED_TOPIC = "/tf"
+"""Topic on which ROS 1's static_transform_publisher of the package tf repeats what is static."""
+REPEATED_TYPES = (TYPE, "tf/msg/tfMessage")
+_CONSTANT = 1e-6
+"""Change of an entry of a transform (m, or of its rotation) up to which it counts as constant."""
 _DEFINITION = "geometry_msgs/TransformStamped[] transforms\n"
 
 _Array = NDArray[np.float64]
@@ -42,6 +47,17 @@ def gathered(messages: Iterable[Any]) -> Transforms:
             T[:3, 3] = position
             found[frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id)] = T
     return found
+
+
+def constant(messages: Iterable[Any]) -> Transforms:
+    """Return the transforms that are equal in all deserialised messages: not those of a frame that moves."""
+    found: Transforms = {}
+    moving: set[tuple[str, str]] = set()
+    for message in messages:
+        for frames, T in gathered([message]).items():
+            if np.abs(T - found.setdefault(frames, T)).max() > _CONSTANT:
+                moving.add(frames)
+    return {frames: T for frames, T in found.items() if frames not in moving}
 
 
 def frame_name(name: str) -> str:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lio_jax.data.cloud_fields import valid_returns
 from lio_jax.data.config import DataConfig
-from lio_jax.data.pointcloud2 import valid_returns
 from lio_jax.data.reconstruct import ring_from_azimuth_wraps, ring_from_elevation
 
 _BYTES_PER_POINT = 16

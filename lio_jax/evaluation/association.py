@@ -53,16 +53,17 @@ def match_by_time(
     inside = (stamps >= first - _SPAN_TOLERANCE_NS) & (stamps <= last + _SPAN_TOLERANCE_NS)
     if not inside.any():
         raise LioJaxError(
-            f"No pose of {estimate_name} lies in the time span of {reference_name}: {_span(estimate)} "
-            f"against {_span(reference)}; both must come from the same recording and clock."
+            f"No pose of {estimate_name} lies in the time span of {reference_name}: "
+            f"{span(estimate.stamp_ns)} against {span(reference.stamp_ns)}; both must come from the same "
+            "recording and clock."
         )
     if not inside.all():
         left_out = f"{int((~inside).sum())} of {len(stamps)} estimated poses"
         notes += (f"{left_out} lie outside the reference's time span and are not compared.",)
-    in_gap = inside & _in_gap(stamps, reference.stamp_ns)
-    if in_gap.any():
-        notes += (f"{int(in_gap.sum())} estimated poses lie in holes of the reference and are not compared.",)
-    keep = inside & ~in_gap
+    holes = inside & in_gap(stamps, reference.stamp_ns)
+    if holes.any():
+        notes += (f"{int(holes.sum())} estimated poses lie in holes of the reference and are not compared.",)
+    keep = inside & ~holes
     if not keep.any():
         raise LioJaxError(
             f"Every pose of {estimate_name} within the span of {reference_name} lies in a hole of it "
@@ -102,7 +103,13 @@ def match_by_index(
     )
 
 
-def _in_gap(stamps: NDArray[np.int64], knots: NDArray[np.int64]) -> NDArray[np.bool_]:
+def in_gap(stamps: NDArray[np.int64], knots: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return whether each stamp lies in a hole between knots, too long for interpolation, (n,).
+
+    Args:
+        stamps: (n,) times, ns.
+        knots: (m,) times of poses, ns, ascending.
+    """
     if len(knots) < 2:
         return np.zeros(len(stamps), bool)
     periods = np.diff(knots)
@@ -127,6 +134,7 @@ def _finite(trajectory: Trajectory, name: str) -> tuple[Trajectory, tuple[str, .
     return Trajectory(trajectory.stamp_ns[finite], trajectory.poses[finite]), (note,)
 
 
-def _span(trajectory: Trajectory) -> str:
-    first, last = int(trajectory.stamp_ns[0]), int(trajectory.stamp_ns[-1])
+def span(stamp_ns: NDArray[np.int64]) -> str:
+    """Return the first and the last of some stamps (n,) as decimal seconds, for messages."""
+    first, last = int(stamp_ns[0]), int(stamp_ns[-1])
     return f"[{ns_to_seconds(first)} .. {ns_to_seconds(last)}] s"

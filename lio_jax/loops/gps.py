@@ -108,6 +108,24 @@ def alignment(
     return EnuAlignment(T_enu_odom, covariance, inlier)
 
 
+def aligned(positions_odom: _Array, fixes: _Array, covariances: _Array) -> tuple[_Array, float]:
+    """Return the (4, 4) T_enu_odom by least squares over all fixes, and the standard deviation of its yaw.
+
+    Unlike :func:`alignment` it leaves no fix out, so that a trajectory which contradicts the fixes gets an
+    alignment, too. The standard deviation, rad, is infinite where the positions do not show the yaw at all.
+
+    Args:
+        positions_odom, fixes, covariances: as in :func:`alignment`, at least one of each.
+    """
+    pairs = _Pairs(positions_odom, fixes, np.linalg.cholesky(np.linalg.inv(covariances)))
+    everything = np.ones(len(fixes), bool)
+    yaw, shift = _solved(pairs, everything.astype(float))
+    covariance = _covariance(pairs, everything, yaw, shift)
+    T_enu_odom = np.eye(4)
+    T_enu_odom[:3, :3], T_enu_odom[:3, 3] = _about_z(yaw), shift
+    return T_enu_odom, np.inf if covariance is None else float(np.sqrt(covariance[0, 0]))
+
+
 def _robust(pairs: _Pairs) -> tuple[float, _Array, _Array]:
     """Return yaw (rad), translation (m) and the weights of the pairs, rarely between 0 and 1."""
     limit = float(chi2.ppf(_CONFIDENCE, 3))
@@ -295,6 +313,18 @@ class GpsGate:
         else:
             self._last_used = antenna
         return found
+
+    def doubt(self, stamp_ns: int, T_odom_imu: _Array) -> Refusal | None:
+        """Return why the fix of the next pose cannot be believed, without using it; None where it can.
+
+        Args:
+            stamp_ns: time of the pose, ns.
+            T_odom_imu: (4, 4) the pose by the odometry, m.
+        """
+        antenna = T_odom_imu[:3, :3] @ self._lever + T_odom_imu[:3, 3]
+        self._move(stamp_ns, antenna)
+        found = self._chosen(stamp_ns, antenna, T_odom_imu, None)
+        return found if isinstance(found, Refusal) else None
 
     def _move(self, stamp_ns: int, antenna: _Array) -> None:
         if self._last is not None:

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lio_jax.data.pointcloud2 import LIVOX_TYPES, decode_custom_msg, keep_by_tag
+from lio_jax.data.cloud_fields import keep_by_tag
+from lio_jax.data.pointcloud2 import LIVOX_TYPES, decode_custom_msg
 from tests.data import bags
 
 SEEN = bags.sweep(columns=20)

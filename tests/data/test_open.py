@@ -10,6 +10,7 @@ from lio_jax.data import detect, native, open_sequence, write_native
 from lio_jax.data.config import DataConfig
 from lio_jax.data.sequence import Reader
 from tests.data import bags
+from tests.data.cloud_files import write_pcd_folder
 from tests.data.test_kitti import write_sequence
 from tests.data.test_kitti_raw import write_drive
 from tests.data.test_native import scans
@@ -53,6 +54,8 @@ def _own(kind: str, folder: Path) -> Path:
         return write_drive(folder)
     if kind == "kitti_odometry":
         return write_sequence(folder)
+    if kind == "clouds":
+        return write_pcd_folder(folder / "s", scans(2))
     return bags.write_bag(folder / "a.bag", bag_messages(moving()[:2], ros2=False))
 
 

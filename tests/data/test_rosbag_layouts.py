@@ -154,3 +154,82 @@ def test_an_empty_scan_in_the_middle_is_yielded_and_reported(tmp_path: Path) -> 
     assert "a: scan 1 (1700000000.223456789 s) holds no points." in sequence.warnings_so_far
     list(sequence.scans())
     assert len(sequence.warnings_so_far) == 2
+
+
+ROBOSENSE_PCL = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "ring", "timestamp"],
+        "formats": ["<f4", "<f4", "<f4", "u1", "<u2", "<f8"],
+        "offsets": [0, 4, 8, 16, 18, 24],
+        "itemsize": 32,
+    }
+)
+
+
+@pytest.mark.parametrize("padding_has_times", [True, False])
+def test_robosense_clouds_padded_with_nan(tmp_path: Path, padding_has_times: bool) -> None:
+    """rslidar_sdk of ROS 1: pcl::toROSMsg of an organised cloud of RsPointXYZIRT, NaN where nothing returned.
+
+    Layout: PCL_ADD_POINT4D, uint8 intensity, uint16 ring, double timestamp, 16-byte aligned.
+    """
+    silent = np.arange(len(SEEN.points)) % 7 == 3
+    messages = []
+    for stamp in scan_starts(3):
+        cloud = bags.fill(ROBOSENSE_PCL, SEEN, stamp * 1e-9 + SEEN.time)
+        for axis in "xyz":
+            cloud[axis][silent] = np.nan
+        if not padding_has_times:
+            cloud["timestamp"][silent] = 0.0
+        message = bags.cloud_message(stamp, cloud, ros2=False, height=bags.RINGS)
+        messages.append(("/rslidar_points", received(stamp), message))
+    sequence = RosbagSequence(bags.write_bag(tmp_path / "a.bag", messages), AUTO)
+    assert "field 'timestamp', float64 s absolute, 0.0989 s a scan" in sequence.info.notes[0]
+    for scan, stamp in zip(sequence.scans(), scan_starts(3), strict=True):
+        assert abs(scan.stamp_ns - stamp) <= 256
+        np.testing.assert_array_equal(scan.points, SEEN.points[~silent])
+        np.testing.assert_array_equal(scan.ring, SEEN.ring[~silent])
+        np.testing.assert_allclose(scan.time, SEEN.time[~silent], atol=1e-6)
+        assert scan.dropped == silent.sum()
+
+
+@pytest.mark.parametrize("layout", ["velodyne", "hesai"])
+def test_two_returns_of_a_firing_share_its_time_and_ring(tmp_path: Path, layout: str) -> None:
+    """Dual return of a Velodyne or Hesai: each firing gives two points, one after the other."""
+    dtype, ticks, said = LAYOUTS[layout]
+    messages = []
+    for stamp in scan_starts(3):
+        one = bags.fill(dtype, SEEN, ticks(stamp))
+        other = one.copy()
+        for axis in "xyz":
+            other[axis] *= np.float32(1.5)
+        cloud = np.stack([one, other], axis=1).ravel()
+        messages.append(("/points", received(stamp), bags.cloud_message(stamp, cloud, ros2=False)))
+    sequence = RosbagSequence(bags.write_bag(tmp_path / "a.bag", messages), AUTO)
+    assert said in sequence.info.notes[0]
+    for scan in sequence.scans():
+        np.testing.assert_array_equal(scan.points[::2], SEEN.points)
+        np.testing.assert_array_equal(scan.points[1::2], SEEN.points * np.float32(1.5))
+        np.testing.assert_allclose(scan.time[::2], SEEN.time, atol=1e-6)
+        np.testing.assert_array_equal(scan.time[1::2], scan.time[::2])
+        np.testing.assert_array_equal(scan.ring[1::2], SEEN.ring)
+
+
+def test_messages_that_hold_parts_of_a_sweep_are_noticed(tmp_path: Path) -> None:
+    """A Velodyne driver whose npackets is a fifth of a turn's packets."""
+    messages = []
+    for stamp in scan_starts(2):
+        for part in range(5):
+            inside = np.floor(SEEN.time / 0.02 + 1e-6) == part
+            cloud = bags.fill(bags.VELODYNE, SEEN, SEEN.time - 0.02 * part)[inside]
+            at = stamp + part * 20_000_000
+            messages.append(("/points", at + 25_000_000, bags.cloud_message(at, cloud, ros2=False)))
+    sequence = RosbagSequence(bags.write_bag(tmp_path / "a.bag", messages), AUTO)
+    (note,) = [note for note in sequence.info.notes if "part of a sweep" in note]
+    assert note.startswith("each cloud holds a part of a sweep only (at most 80 deg of azimuth)")
+
+
+def test_a_narrow_view_is_no_part_of_a_sweep(tmp_path: Path) -> None:
+    ahead = SEEN.points[:, 0] > np.abs(SEEN.points[:, 1])
+    clouds = [bags.fill(bags.VELODYNE, SEEN, SEEN.time)[ahead]] * 4
+    path = bags.write_bag(tmp_path / "a.bag", cloud_messages(tmp_path / "a.bag", clouds))
+    assert not any("part of a sweep" in note for note in RosbagSequence(path, AUTO).info.notes)

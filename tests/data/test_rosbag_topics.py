@@ -56,6 +56,23 @@ def test_of_two_lidars_the_busier_is_taken_and_reported(tmp_path: Path) -> None:
         assert not any("was taken" in note for note in chosen.info.notes)
 
 
+def test_of_two_imus_the_faster_is_taken_and_reported(tmp_path: Path) -> None:
+    """An Ouster publishes its own IMU at 100 Hz as /ouster/imu; another one is mounted beside it."""
+    slow = imu_messages(40, ros2=False)
+    fast = [("/imu/data", at + half, message) for _, at, message in slow for half in (0, 5_000_000)]
+    slow = [("/ouster/imu", at, message) for _, at, message in slow]
+    rows = in_order(bags.velodyne_messages(3, ros2=False) + slow + fast)
+    path = bags.write_bag(tmp_path / "a.bag", rows)
+    sequence = RosbagSequence(path, AUTO)
+    assert sequence.info.notes[0] == (
+        "imu: topic /imu/data was taken (80 messages); there is also "
+        "/ouster/imu (sensor_msgs/msg/Imu, 40): choose with --set config.data.imu_topic=/ouster/imu"
+    )
+    chosen = RosbagSequence(path, replace(AUTO, imu_topic="/ouster/imu")).imu()
+    assert chosen is not None
+    assert len(chosen.stamp_ns) == 40
+
+
 @pytest.mark.parametrize("key", ["lidar_topic", "imu_topic", "gps_topic"])
 def test_a_topic_that_does_not_exist_lists_those_that_do(tmp_path: Path, key: str) -> None:
     path = bags.write_bag(

@@ -54,6 +54,52 @@ def test_leading_slashes_are_ros_1s(tmp_path):
     np.testing.assert_array_equal(named.info.T_imu_lidar, plain.info.T_imu_lidar)
 
 
+def repeated(tmp_path, name: str, trees, static=None) -> RosbagSequence:
+    """Open a bag in which /tf sends one tree after another."""
+    path = tmp_path / name
+    ros2 = bags.is_ros2(path)
+    messages = cloud_messages(path, [bags.fill(bags.VELODYNE, SEEN)] * 3) + imu_messages(60, ros2)
+    for number, tree in enumerate(trees):
+        at = bags.START_NS + number * 10_000_000
+        messages.append(("/tf", at, bags.transform_message(at, tree, ros2)))
+    if static:
+        said = bags.transform_message(bags.START_NS, static, ros2)
+        messages.append(("/tf_static", bags.START_NS, said))
+    return RosbagSequence(bags.write_bag(path, in_order(messages)), DataConfig())
+
+
+def driving(number: int) -> dict:
+    return {("odom", "base_link"): ((0.1 * number, 0.0, 0.0), UPRIGHT)}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_what_tf_repeats_without_change_is_static(tmp_path, name):
+    """tf/static_transform_publisher of ROS 1 sends on /tf, with the moving frames of the odometry."""
+    sequence = repeated(tmp_path, name, [TREE | driving(number) for number in range(30)])
+    expected = opened(tmp_path, f"static_{name}", TREE).info.T_imu_lidar
+    np.testing.assert_allclose(sequence.info.T_imu_lidar, expected, atol=1e-15)
+    assert "T_imu_lidar: /tf states the pose of lidar in imu_link" in sequence.info.notes
+
+
+def test_tf_completes_tf_static(tmp_path):
+    mast = {key: value for key, value in TREE.items() if "mast" in key}
+    rest = {key: value for key, value in TREE.items() if "mast" not in key}
+    sequence = repeated(tmp_path, "a.mcap", [rest] * 30, static=mast)
+    expected = opened(tmp_path, "b.mcap", TREE).info.T_imu_lidar
+    np.testing.assert_allclose(sequence.info.T_imu_lidar, expected, atol=1e-15)
+
+
+def test_a_frame_that_moves_ties_nothing(tmp_path):
+    """The IMU's frame stands at first and moves later, as a second vehicle's would."""
+    moves = [
+        TREE | {("base_link", "imu_link"): ((0.1 + 0.01 * max(number - 15, 0), 0.0, 0.5), UPRIGHT)}
+        for number in range(30)
+    ]
+    sequence = repeated(tmp_path, "a.bag", moves)
+    assert sequence.info.T_imu_lidar is None
+    assert "T_imu_lidar: /tf does not tie lidar to imu_link" in sequence.info.notes
+
+
 def test_frames_that_nothing_ties_together_are_named(tmp_path):
     tree = {key: value for key, value in TREE.items() if "imu_link" not in key}
     sequence = opened(tmp_path, "a.mcap", tree)

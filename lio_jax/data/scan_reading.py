@@ -1,48 +1,26 @@
-"""Turn point-cloud messages into LidarScans, after recognising the layout from a topic's first messages."""
+"""Turn clouds into LidarScans, after recognising from the first clouds how they state times and rings."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.errors import LioJaxError
 from lio_jax.core.timestamps import ns_to_seconds
-from lio_jax.data import pointcloud2
-from lio_jax.data.bag_files import Topic, why
+from lio_jax.data.cloud_fields import RawCloud
 from lio_jax.data.config import DataConfig
 from lio_jax.data.point_time import PointTiming, TimeSample, recognise_point_time, scan_period, stamp_end
-from lio_jax.data.pointcloud2 import RawCloud, decode_pointcloud2
 from lio_jax.data.reconstruct import azimuth_time, check_beams, guess_beams, ring_from_elevation
 from lio_jax.data.sequence import LidarScan
 
-if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
-
-_SCANS_LOOKED_AT = 8
-
-
-def decode_cloud(reader: "AnyReader", topic: Topic, raw: bytes, time_field: str, where: str) -> RawCloud:
-    """Decode one serialised message of ``topic``.
-
-    Raises:
-        LioJaxError: the topic's layout cannot be used.
-        ValueError: this one message is damaged.
-    """
-    if topic.type in pointcloud2.LIVOX_TYPES:
-        return pointcloud2.decode_custom_msg(raw, reader.is2)
-    try:
-        message: Any = reader.deserialize(raw, topic.type)
-    # The generated decoders raise struct, index, unicode or their own errors on damaged bytes.
-    except Exception as error:
-        raise ValueError(f"the message cannot be decoded: {why(error)}") from error
-    return decode_pointcloud2(message, time_field=time_field, where=where)
+SCANS_LOOKED_AT = 8
+"""Number of clouds with points from which their reading is recognised."""
 
 
 @dataclass(frozen=True)
 class ScanReading:
-    """How a topic's clouds become scans; all scans of the topic share it."""
+    """How a recording's clouds become scans; all scans share it."""
 
     timing: PointTiming | None
     """Meaning of the point times; None where they are reconstructed or the points are motion compensated."""
@@ -92,66 +70,80 @@ class ScanReading:
         return *self.timing.place(cloud.stamp_ns, time, low, high), keep
 
 
-def recognise_scans(
-    reader: "AnyReader",
-    topic: Topic,
-    messages: Iterable[tuple[Any, int, bytes]],
-    config: DataConfig,
-    where: str,
-) -> ScanReading:
-    """Settle from the topic's first scans with points how its clouds are read.
+def recognise_clouds(
+    clouds: Iterable[tuple[RawCloud, int]], config: DataConfig, where: str, stamped: bool = True
+) -> ScanReading | None:
+    """Settle from the first clouds with points how clouds are read; None where there are no clouds.
 
     Args:
-        reader: the open bag.
-        topic: the topic of the point clouds.
-        messages: (connection, receipt time in ns, bytes) of each message of the topic, in order.
+        clouds: each cloud with the time of its receipt, ns, in recorded order; only the first are taken.
         config: settings that override what is recognised.
-        where: name of bag and topic in errors.
+        where: what is read, in errors.
+        stamped: whether the clouds' stamps are recorded; false where they are only counted.
 
     Raises:
-        LioJaxError: the layout cannot be used, or no message can be decoded.
+        UsageError: the settings name a number of beams that the points do not fit.
     """
     first: RawCloud | None = None
+    sectors: list[frozenset[int]] = []
     headers: list[int] = []
     samples: list[TimeSample] = []
     beams: list[int] = []
-    kind = reason = ""
-    for _, received_ns, raw in messages:
-        try:
-            cloud = decode_cloud(reader, topic, raw, config.time_field, where)
-        except ValueError as error:
-            reason = f" ({error})"
-            continue
+    kind = ""
+    for cloud, received_ns in clouds:
         if first is None or not len(first.points):
             first = cloud
         if not len(cloud.points):
             continue
         headers.append(cloud.stamp_ns)
+        sectors.append(_sectors(cloud.points))
         if cloud.ring is None:
             beams.append(config.beams or guess_beams(cloud.points))
         low, high = cloud.time_range or (0, 0)
         if cloud.time is not None:
             kind = cloud.time.dtype.name
         samples.append(TimeSample(cloud.stamp_ns, received_ns, low, high))
-        if len(headers) == _SCANS_LOOKED_AT:
+        if len(headers) == SCANS_LOOKED_AT:
             break
     if first is None:
-        raise LioJaxError(
-            f"{where}: no point cloud can be read{reason}; the recording is empty or damaged there."
-        )
+        return None
     chosen_beams = max(set(beams), key=beams.count) if beams else config.beams or 16
-    ring_note = _ring_note(first, chosen_beams, config.beams > 0, where)
+    ring_note = (*_ring_note(first, chosen_beams, config.beams > 0, where), *_parts_note(sectors))
     if config.compensated == "yes":
         time_note = "points are taken as motion compensated to the header stamp (config.data.compensated)"
         return ScanReading(None, "start", 0.0, chosen_beams, (time_note, *ring_note))
-    timing = recognise_point_time(samples, first.time_field, kind, config) if kind else None
+    timing = recognise_point_time(samples, first.time_field, kind, config, stamped) if kind else None
     if timing is not None:
         return ScanReading(timing, "start", timing.sweep, chosen_beams, (timing.note, *ring_note))
     period = scan_period(headers, config.scan_period)
-    stamp_at, note = stamp_end(samples, period, config) if samples else ("start", "no points in any message")
+    stamp_at, note = stamp_end(samples, period, config) if samples else ("start", "no points in any cloud")
     missing = f"field {first.time_field!r} holds a single value" if first.time_field else "not recorded"
     time_note = f"per-point time: {missing}, reconstructed from azimuth over {period:.4g} s a scan, {note}"
     return ScanReading(None, stamp_at, period, chosen_beams, (time_note, *ring_note))
+
+
+_SECTORS = 36
+
+
+def _sectors(points: NDArray[np.float32]) -> frozenset[int]:
+    """Return the sectors of 10 deg of azimuth that hold points."""
+    turned = np.arctan2(points[:, 1], points[:, 0])
+    return frozenset(np.unique(((turned / (2 * np.pi)) % 1.0 * _SECTORS).astype(int)).tolist())
+
+
+def _parts_note(sectors: list[frozenset[int]]) -> tuple[str, ...]:
+    """Return a sentence if clouds that follow each other see different sectors, as parts of a sweep do."""
+    largest = max(map(len, sectors), default=0)
+    if len(sectors) < 3 or largest > 0.6 * _SECTORS:
+        return ()
+    # a sensor with a narrow view sees the same sectors in each cloud
+    if len(frozenset().union(*sectors)) < 1.5 * largest:
+        return ()
+    sentence = (
+        f"each cloud holds a part of a sweep only (at most {10 * largest} deg of azimuth) and is read as a "
+        "scan of its own; let the driver publish whole sweeps"
+    )
+    return (sentence,)
 
 
 def _ring_note(cloud: RawCloud, beams: int, given: bool, where: str) -> tuple[str, ...]:
