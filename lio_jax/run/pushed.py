@@ -177,18 +177,23 @@ def rehearse(settings: Settings, scan: LidarScan, imu_rate: float) -> None:
         scan: of the size of the run's scans; it is repeated.
         imu_rate: samples per second.
     """
-    for history_s in (0.0, 1.0):
+    period_ns, step_ns = max(round(scan.duration * 1e9), 1), max(round(1e9 / imu_rate), 1)
+    # samples of up to a second before the first scan have a padded size of their own
+    earlier = [0.0, _HISTORY_S]
+    if uses_imu(settings):
+        earlier += [size / imu_rate - scan.duration for size in feed_of(None, settings).sizes]
+    for history_s in sorted(seconds for seconds in earlier if 0 <= seconds <= _HISTORY_S):
         odometry = PushedOdometry(settings)
-        period_ns = max(round(scan.duration * 1e9), 1)
-        origin = scan.stamp_ns - round(history_s * 1e9)
-        last = scan.stamp_ns + _REHEARSED * period_ns
-        step = max(round(1e9 / imu_rate), 1)
-        for stamp_ns in range(origin, last + 2 * step, step):
+        count = 1 if history_s else _REHEARSED
+        last = scan.stamp_ns + (count + 1) * period_ns
+        for stamp_ns in range(scan.stamp_ns - round(history_s * 1e9), last, step_ns):
             odometry.push_imu(stamp_ns, np.zeros(3), [0.0, 0.0, 9.81])
-        for number in range(_REHEARSED):
+        for number in range(count):
             odometry.push_scan(replace(scan, stamp_ns=scan.stamp_ns + number * period_ns))
         odometry.finish()
 
 
 _REHEARSED = 4
 """Number of scans of a rehearsal: the second one goes back to the first."""
+_HISTORY_S = 1.0
+"""Time before the first scan from which samples are used, s."""

@@ -132,6 +132,11 @@ class ImuFeed:
         first, last = np.searchsorted(self._stamps, bounds).tolist()
         return self._padded(first, last, scan.stamp_ns)
 
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Return the padded sizes, ascending."""
+        return self._buckets
+
     def append(self, later: ImuData) -> None:
         """Add later samples with strictly ascending stamps and without orientations."""
         self._stamps = np.concatenate([self._stamps, later.stamp_ns])

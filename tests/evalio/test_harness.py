@@ -14,6 +14,7 @@ from evalio import datasets, pipelines, stats
 from evalio._cpp.types import VisOption
 from evalio.types import ImuMeasurement, Trajectory
 
+import lio_jax
 import lio_jax.evalio
 from lio_jax.data import open_sequence
 from lio_jax.data.evalio_points import scan_of
@@ -31,6 +32,7 @@ from lio_jax.run.track import track
 from lio_jax.sim.sensors import SENSORS
 from lio_jax.sim.sequence import WORLDS
 
+ROOT = Path(lio_jax.__file__).parents[1]
 SCANS = 50
 NAME = "lio_jax_street/generic16_0"
 
@@ -57,7 +59,7 @@ def evalio(data: Path, *words: str) -> subprocess.CompletedProcess:
         capture_output=True,
         text=True,
         env=environment,
-        cwd=data,
+        cwd=ROOT,
         timeout=900,
         check=False,
     )
@@ -136,7 +138,7 @@ def test_every_recipe_and_world_is_registered():
 def test_before_initialisation_jax_is_not_started():
     code = (
         "import lio_jax.evalio as e; from jax._src import xla_bridge; p = e.LioJaxDefault();"
-        "p.set_params(p.default_params()); e.LioJaxCity('os1_64_1').lidar_params(); e.LioJaxCity('os1_64_1').imu_T_lidar();"
+        "p.set_params(p.default_params()); d = e.LioJaxCity('os1_64_1'); d.lidar_params(); d.imu_T_lidar();"
         "assert not xla_bridge._backends"
     )
     # evalio forks, which a process that runs JAX does not survive
