@@ -1,5 +1,6 @@
 """The recipes in evalio's harness, and the simulated worlds as its datasets."""
 
+import importlib
 import os
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from evalio.types import ImuMeasurement, Trajectory
 
 import lio_jax
 import lio_jax.evalio
+from lio_jax.core.errors import LioJaxError
 from lio_jax.data import open_sequence
 from lio_jax.data.evalio_points import scan_of
 from lio_jax.evalio.datasets import (
@@ -213,3 +215,39 @@ def test_a_sequence_is_there_once_it_is_simulated(street):
     assert not WORLD_DATASETS["street"]("generic16_1").is_downloaded()
     truth = street.ground_truth()
     assert len(truth) == 10 * SCANS + 1
+
+
+def test_a_sequence_of_evalio_is_a_recording(street):
+    datasets.register_dataset(module=lio_jax.evalio)
+    read, own = open_sequence(f"evalio:{NAME}"), open_sequence(street.folder)
+    assert read.info.format == "evalio"
+    assert read.info.scan_count == SCANS
+    np.testing.assert_allclose(read.info.T_imu_lidar, own.info.T_imu_lidar, atol=1e-12)
+    scan, expected = next(read.scans(7, 1)), next(own.scans(7, 1))
+    assert (scan.stamp_ns, scan.duration) == (expected.stamp_ns, expected.duration)
+    np.testing.assert_array_equal(scan.points, expected.points)
+    assert len(list(read.scans(SCANS - 2, 5))) == 2
+    for name in ("stamp_ns", "gyro", "accel"):
+        np.testing.assert_array_equal(getattr(read.imu(), name), getattr(own.imu(), name))
+    np.testing.assert_array_equal(read.truth().stamp_ns, own.truth().stamp_ns)
+    np.testing.assert_allclose(read.truth().poses, own.truth().poses, atol=1e-9)
+    assert read.gps() is None
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("lio_jax_street/nothing", "knows no such sequence"), ("lio_jax_street/livox_2", "evalio dl lio_jax")],
+)
+def test_a_sequence_that_is_not_there_is_named(name, words, street):
+    datasets.register_dataset(module=lio_jax.evalio)
+    with pytest.raises(LioJaxError, match=words):
+        open_sequence(f"evalio:{name}")
+
+
+def test_without_evalio_one_sentence_says_so(monkeypatch):
+    monkeypatch.setitem(sys.modules, "evalio", None)
+    with pytest.raises(LioJaxError, match="evalio is not installed; install it"):
+        open_sequence("evalio:newer_college_2020/short_experiment")
+    monkeypatch.delitem(sys.modules, "lio_jax.evalio")
+    with pytest.raises(ImportError, match="needs evalio"):
+        importlib.import_module("lio_jax.evalio")
