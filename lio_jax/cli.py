@@ -126,7 +126,7 @@ def run(
     """Estimate trajectory and map of a recording.
 
     Args:
-        data: Recording: KITTI odometry sequence or raw drive, ROS 1 or ROS 2 bag, native folder, or evalio:NAME.
+        data: Recording: KITTI odometry sequence or raw drive, ROS 1 or ROS 2 bag, native folder, evalio:NAME.
         out: Folder for the results.
         recipe: Recipe or settings file; a run's config.yaml repeats that run. None means default, or with
             --params-from the recipe that follows that system.

@@ -9,8 +9,7 @@ from lio_jax.data.config import DataConfig
 from lio_jax.data.sequence import Reader, Sequence, entries
 
 READERS = (kitti.READER, kitti_raw.READER, native.READER, rosbag.READER)
-"""Readers of files; the first one that recognises a path opens it. A new format is a module and an
-entry."""
+"""Readers of files; the first one that recognises a path opens it. A new format is a module and an entry."""
 BY_NAME = evalio_sequences.READER
 """The reader of sequences that are no path."""
 
