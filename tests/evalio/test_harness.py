@@ -129,8 +129,6 @@ def test_evalio_finds_pipelines_and_datasets_by_name(data):
 
 
 def test_every_recipe_and_world_is_registered():
-    pipelines.register_pipeline(module=lio_jax.evalio)
-    datasets.register_dataset(module=lio_jax.evalio)
     names = {f"lio_jax_{recipe}" for recipe in RECIPES}
     assert {name for name in pipelines.all_pipelines() if name.startswith("lio_jax")} == names
     worlds = {f"lio_jax_{world}" for world in WORLDS}
@@ -218,7 +216,6 @@ def test_a_sequence_is_there_once_it_is_simulated(street):
 
 
 def test_a_sequence_of_evalio_is_a_recording(street):
-    datasets.register_dataset(module=lio_jax.evalio)
     read, own = open_sequence(f"evalio:{NAME}"), open_sequence(street.folder)
     assert read.info.format == "evalio"
     assert read.info.scan_count == SCANS
@@ -239,7 +236,6 @@ def test_a_sequence_of_evalio_is_a_recording(street):
     [("lio_jax_street/nothing", "knows no such sequence"), ("lio_jax_street/livox_2", "evalio dl lio_jax")],
 )
 def test_a_sequence_that_is_not_there_is_named(name, words, street):
-    datasets.register_dataset(module=lio_jax.evalio)
     with pytest.raises(LioJaxError, match=words):
         open_sequence(f"evalio:{name}")
 
