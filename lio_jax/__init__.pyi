@@ -50,6 +50,7 @@ from .recipes.recipe import Recipe as Recipe
 from .recipes.recipe import State as State
 from .registration.voxel_planes import associate as associate
 from .registration.voxel_planes import point_noise as point_noise
+from .run.pushed import PushedOdometry as PushedOdometry
 from .run.run import imu_feed as imu_feed
 from .run.run import run_sequence as run_sequence
 from .run.run import settings_for as settings_for

@@ -126,7 +126,8 @@ def run(
     """Estimate trajectory and map of a recording.
 
     Args:
-        data: Recording: KITTI odometry sequence or raw drive, ROS bag, folder of clouds, native folder.
+        data: Recording: KITTI odometry sequence or raw drive, ROS bag, folder of clouds, native folder, or
+            evalio:NAME.
         out: Folder for the results.
         recipe: Recipe or settings file; a run's config.yaml repeats that run. None means default, or with
             --params-from the recipe that follows that system.

@@ -4,12 +4,14 @@ from dataclasses import fields
 from pathlib import Path
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data import clouds, kitti, kitti_raw, native, rosbag
+from lio_jax.data import clouds, evalio_sequences, kitti, kitti_raw, native, rosbag
 from lio_jax.data.config import DataConfig
 from lio_jax.data.sequence import Reader, Sequence, entries
 
 READERS = (kitti.READER, kitti_raw.READER, native.READER, rosbag.READER, clouds.READER)
-"""All readers; the first one that recognises a path opens it. A new format is a module and an entry here."""
+"""Readers of files; the first one that recognises a path opens it. A new format is a module and an entry."""
+BY_NAME = evalio_sequences.READER
+"""The reader of sequences that are no path."""
 
 _BY_THE_RUN = {"prefetch"}
 """Fields that a run reads itself, whatever the format."""
@@ -22,7 +24,7 @@ def open_sequence(path: Path | str, config: DataConfig | None = None) -> Sequenc
 
     Args:
         path: a KITTI odometry sequence folder, a KITTI raw drive folder, a ROS 1 or ROS 2 bag, a native
-            folder, or a folder of clouds.
+            folder, or a folder of clouds; or ``evalio:DATASET/SEQUENCE``, a sequence that evalio knows.
         config: how the recording is read; None: the defaults, which recognise everything from the data.
 
     Raises:
@@ -30,6 +32,8 @@ def open_sequence(path: Path | str, config: DataConfig | None = None) -> Sequenc
     """
     path = Path(path)
     config = DataConfig() if config is None else config
+    if BY_NAME.recognises(path):
+        return BY_NAME.open(path, config)
     if not path.exists():
         raise LioJaxError(f"{path}: no such file or folder; check the path.")
     reader = _reader_of(path)
@@ -45,7 +49,7 @@ def without_effect(format_name: str, config: DataConfig) -> list[str]:
         format_name: ``SequenceInfo.format``; the result is empty for one that no reader has.
         config: how the recording is read.
     """
-    reads = next((reader.reads for reader in READERS if reader.name == format_name), None)
+    reads = next((reader.reads for reader in (*READERS, BY_NAME) if reader.name == format_name), None)
     if reads is None:
         return []
     unread = [field for field in fields(config) if field.name not in reads | _BY_THE_RUN]

@@ -99,6 +99,28 @@ def with_inertial_noise(sequence: Sequence, settings: Settings) -> tuple[Setting
     return settings, [f"noise of the inertial samples, with a margin of {_MARGIN:g}: {', '.join(words)}."]
 
 
+def with_given_noise(settings: Settings, gyro_noise: float, accel_noise: float) -> Settings:
+    """Return settings with the inertial sensor's white noise as its calibration states it.
+
+    As with noise that a recording shows, a margin is added, and the recipe's own values are bounds. Recipes
+    that do not take their noise from the recording keep their own values, and so does what was given.
+
+    Args:
+        settings: of a recipe that uses inertial samples.
+        gyro_noise: rad/s/sqrt(Hz).
+        accel_noise: m/s^2/sqrt(Hz).
+    """
+    if not recipe_named(settings.recipe).noise_from_recording:
+        return settings
+    for path, noise in zip(_NOISE, (gyro_noise, accel_noise), strict=True):
+        _, section, name = path.split(".")
+        own = settings.values[section][name]
+        if path not in settings.given:
+            value = min(max(_MARGIN * noise, _QUIETEST * own), own)
+            settings = settings.with_value(path, value, "the sensor's calibration")
+    return settings
+
+
 _RANGE = "params.lidar.range_sigma"
 _ROUGHNESS_M = 0.025
 """Standard deviation of a surface from the plane of its voxel, m, which neighbouring returns do not show."""

@@ -115,7 +115,7 @@ class Structured(Protocol):
 
 
 class Fed(Protocol):
-    """One scan as a step takes it; see :class:`lio_jax.run.track.ScanInput`."""
+    """One scan as a step takes it; see :class:`lio_jax.run.scan_inputs.ScanInput`."""
 
     @property
     def end_ns(self) -> int:

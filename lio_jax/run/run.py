@@ -12,7 +12,7 @@ from typing import Any
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.data.detect import without_effect
 from lio_jax.data.imu_checks import cleaned
-from lio_jax.data.sequence import LidarScan, Sequence
+from lio_jax.data.sequence import ImuData, LidarScan, Sequence
 from lio_jax.imu.params import OrientedImuConfig
 from lio_jax.recipes.params import InertialConfig
 from lio_jax.run.fitted_settings import (
@@ -192,18 +192,34 @@ def imu_feed(sequence: Sequence, settings: Settings) -> tuple[ImuFeed | None, tu
 
     None where the recording holds none or ``config.imu.use`` is false: the recipe then does without.
     """
-    config = settings.config
-    if not isinstance(config, InertialConfig) or not config.imu.use:
+    if not uses_imu(settings):
         return None, ()
     recorded = sequence.imu()
     if recorded is None or not len(recorded.stamp_ns):
         return None, ()
     imu, found = cleaned(recorded, "IMU", sequence.info.T_imu_lidar)
+    return feed_of(imu, settings), found
+
+
+def uses_imu(settings: Settings) -> bool:
+    """Return whether the recipe takes inertial samples and is to use them."""
+    return isinstance(settings.config, InertialConfig) and settings.config.imu.use
+
+
+def feed_of(imu: ImuData | None, settings: Settings) -> ImuFeed:
+    """Return a feed of checked samples as the settings of a recipe that uses them want it.
+
+    Args:
+        imu: all samples; None: there are none yet.
+        settings: of the run.
+    """
+    config = settings.config
+    assert isinstance(config, InertialConfig)
     estimated = settings.values["initial"]["time_offset_sigma"] > 0
     margin = OFFSET_MARGIN_S if estimated else 0.0
     offset = settings.values["extrinsics"]["time_offset"]
     own = isinstance(config.imu, OrientedImuConfig) and config.imu.orientation
-    return ImuFeed(imu, config.imu.buckets, offset, margin, own), found
+    return ImuFeed(imu, config.imu.buckets, offset, margin, own)
 
 
 def _described(sequence: Sequence) -> dict[str, Any]:

@@ -1,13 +1,19 @@
 """Turn scans and inertial samples into the padded arrays of a step."""
 
+import time
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from lio_jax.core.types import ImuBatch, Scan, state_dtype
 from lio_jax.data.imu_checks import coverage
 from lio_jax.data.sequence import ImuData, LidarScan
 from lio_jax.lidar.params import ScanConfig
+from lio_jax.run.shown_motion import first_velocity
+from lio_jax.settings.settings import Settings
 
 
 def bucket_for(count: int, config: ScanConfig) -> int:
@@ -126,6 +132,27 @@ class ImuFeed:
         first, last = np.searchsorted(self._stamps, bounds).tolist()
         return self._padded(first, last, scan.stamp_ns)
 
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Return the padded sizes, ascending."""
+        return self._buckets
+
+    def append(self, later: ImuData) -> None:
+        """Add later samples with strictly ascending stamps and without orientations."""
+        self._stamps = np.concatenate([self._stamps, later.stamp_ns])
+        values = np.concatenate([later.gyro, later.accel], axis=1).astype(self._values.dtype)
+        self._values = np.concatenate([self._values, values])
+
+    def forget(self, before_ns: int) -> None:
+        """Drop the samples before a time of the lidar's clock."""
+        first = int(np.searchsorted(self._stamps, before_ns + self._offset_ns))
+        self._stamps, self._values = self._stamps[first:], self._values[first:]
+
+    def reaches(self, end_ns: int) -> bool:
+        """Return whether there are samples up to a scan's end, one beyond it included."""
+        needed = end_ns + self._offset_ns + self._margin_ns
+        return len(self._stamps) > 0 and int(self._stamps[-1]) >= needed
+
     def warnings(self) -> list[str]:
         """Return one sentence for each way in which the samples failed to cover the scans so far."""
         if self._imu is None:
@@ -184,3 +211,96 @@ class ImuFeed:
         if self._with_orientation:
             arrays["orientation"] = values[:, 6:]
         return ImuBatch(**arrays)
+
+
+@dataclass(frozen=True)
+class ScanInput:
+    """One scan as a step takes it."""
+
+    index: int
+    end_ns: int
+    count: int
+    """Points of the scan as it was recorded."""
+    covered: bool
+    """Whether something covers the sensor; the points are then masked."""
+    usable: bool
+    """Whether the scan can begin a map, or a map has begun before it."""
+    scan: Scan
+    imu: ImuBatch | None
+    before: ImuBatch | None
+    """Samples up to this scan's end, for a start here; None after the first usable scan."""
+    first_velocity: NDArray[np.float64] | None
+    """(3,) velocity at the first scan's end that this second scan shows, m/s along the IMU's axes; None for
+    the other scans, and where the vehicle is slow or ``params.initial.velocity`` is not zero."""
+    pad_ms: float
+    begun_at: float = 0.0
+    """Host time at which its step began, s."""
+
+
+class InputsInTurn:
+    """Turns scans into the inputs of steps, one scan at a time."""
+
+    def __init__(self, settings: Settings, imu: ImuFeed | None) -> None:
+        """Begin a run.
+
+        Args:
+            settings: padded sizes, ranges, and whether the first velocity is searched.
+            imu: inertial samples that cover the scans; None: the recipe does without.
+        """
+        self._settings, self._imu = settings, imu
+        self._to_search = not any(settings.values["initial"]["velocity"])
+        self._R_imu_lidar = Rotation.from_quat(settings.values["extrinsics"]["rotation"])
+        self._last_end_ns: int | None = None
+        self._last_count = self._size = self._index = 0
+        self._first: ScanInput | None = None
+        self._opened = False
+
+    def __call__(self, scan: LidarScan) -> ScanInput:
+        """Return the next scan in padded arrays, with the inertial samples that cover it."""
+        start = time.perf_counter()
+        settings, imu, first = self._settings, self._imu, self._first
+        count = len(scan.points)
+        covered = is_covered(scan)
+        # an empty or torn scan among whole ones is not worth compiling a program of its own size
+        if count >= _STRAGGLER * self._last_count:
+            self._size = bucket_for(count, settings.config.lidar)
+        arrays = padded(scan, self._last_end_ns, settings.config.lidar, self._size)
+        samples = imu.batch(scan, self._last_end_ns) if imu else None
+        before = imu.before(scan) if imu and first is None else None
+        if covered:
+            nothing: Any = np.zeros(len(arrays.mask), np.bool_)
+            arrays = replace(arrays, mask=nothing)
+        usable = self._opened or sees_enough(arrays, settings)
+        velocity = None
+        if first is not None and not self._opened and usable and self._to_search:
+            interval = (scan.end_ns - first.end_ns) * 1e-9
+            velocity = first_velocity(first.scan, arrays, interval, first.before, samples, self._R_imu_lidar)
+        pad_ms = (time.perf_counter() - start) * 1e3
+        fed = ScanInput(
+            self._index, scan.end_ns, count, covered, usable, arrays, samples, before, velocity, pad_ms
+        )
+        self._opened = first is not None
+        self._first = first or (fed if usable else None)
+        self._last_end_ns, self._last_count = scan.end_ns, count
+        self._index += 1
+        return fed
+
+
+_COVERED_M, _COVERED_SHARE = 1.0, 0.95
+"""A scan shows nothing but a cover if this share of its points is nearer than this distance, m."""
+_STRAGGLER = 0.25
+"""A scan with less than this share of the points of the scan before keeps that one's padded size."""
+
+
+def is_covered(scan: LidarScan) -> bool:
+    """Return whether nearly all points are so near that something covers the sensor."""
+    some = scan.points[:: max(1, len(scan.points) // 1000)]
+    return len(some) > 0 and bool(np.mean(np.linalg.norm(some, axis=1) < _COVERED_M) > _COVERED_SHARE)
+
+
+def sees_enough(scan: Scan, settings: Settings) -> bool:
+    """Return whether a scan has the points in range that a match needs; a blocked sensor has none."""
+    lidar, needed = settings.values["lidar"], settings.values["registration"]["min_matches"]
+    squared = np.einsum("ij,ij->i", scan.points, scan.points)
+    in_range = (squared > lidar["min_range"] ** 2) & (squared < lidar["max_range"] ** 2) & scan.mask
+    return int(np.count_nonzero(in_range)) >= needed

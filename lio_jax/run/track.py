@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.core.xla import programs
@@ -20,8 +19,8 @@ from lio_jax.recipes.params import RecipeParams as Params
 from lio_jax.recipes.transforms import RecipeLike, Stepper, reopened, with_first_velocity
 from lio_jax.run.failures import BridgedOutage, OutageWatch, ScanEvidence, failure_of, longest_gap
 from lio_jax.run.journal import Journal
-from lio_jax.run.scan_inputs import ImuFeed, bucket_for, padded
-from lio_jax.run.shown_motion import MotionCheck, ShownMotion, first_velocity
+from lio_jax.run.scan_inputs import ImuFeed, InputsInTurn, ScanInput
+from lio_jax.run.shown_motion import MotionCheck, ShownMotion
 from lio_jax.settings.settings import Settings, recipe_of
 
 
@@ -153,7 +152,7 @@ def track(
         compiled_s = step.compile_s
         try:
             for fed, state, output in run_steps(step, inputs, journal.state if journal else None):
-                reading = reader.submit(_on_host, state.nav, output.registration)
+                reading = reader.submit(on_host, state.nav, output.registration)
                 compiled_in_step_s, compiled_s = step.compile_s - compiled_s, step.compile_s
                 if held is not None:
                     last, held = held, None
@@ -171,7 +170,7 @@ def track(
             yield judged(*held)
 
 
-def _on_host(nav: Any, registration: Any) -> tuple[Any, Any, float]:
+def on_host(nav: Any, registration: Any) -> tuple[Any, Any, float]:
     """Return copies with numpy leaves, and the host time when they were there, s."""
     nav, registration = jax.tree.map(np.array, (nav, registration))
     return nav, registration, time.perf_counter()
@@ -187,7 +186,7 @@ class ResultBuilder:
         self._outages = OutageWatch()
 
     def __call__(
-        self, fed: "ScanInput", nav: Any, registration: Any, output: Any, step_ms: float
+        self, fed: ScanInput, nav: Any, registration: Any, output: Any, step_ms: float
     ) -> ScanResult:
         """Return the result of a scan; ``nav`` and ``registration`` have numpy leaves."""
         evidence = ScanEvidence(
@@ -228,96 +227,61 @@ class ResultBuilder:
         )
 
 
-@dataclass(frozen=True)
-class ScanInput:
-    """One scan as a step takes it."""
-
-    index: int
-    end_ns: int
-    count: int
-    """Points of the scan as it was recorded."""
-    covered: bool
-    """Whether something covers the sensor; the points are then masked."""
-    usable: bool
-    """Whether the scan can begin a map, or a map has begun before it."""
-    scan: Scan
-    imu: ImuBatch | None
-    before: ImuBatch | None
-    """Samples up to this scan's end, for a start here; None after the first usable scan."""
-    first_velocity: NDArray[np.float64] | None
-    """(3,) velocity at the first scan's end that this second scan shows, m/s along the IMU's axes; None for
-    the other scans, and where the vehicle is slow or ``params.initial.velocity`` is not zero."""
-    pad_ms: float
-    begun_at: float = 0.0
-    """Host time at which its step began, s."""
-
-
 def scan_inputs(settings: Settings, scans: Iterable[LidarScan], imu: ImuFeed | None) -> Generator[ScanInput]:
     """Yield each scan in padded arrays, with the inertial samples that cover it.
 
     ``config.data.prefetch`` of them are decoded and padded ahead on a thread, which ends when the generator
     is closed.
     """
-    return prefetched(_padded_in_turn(settings, scans, imu), settings.run.data.prefetch)
+    in_turn = InputsInTurn(settings, imu)
+    return prefetched((in_turn(scan) for scan in scans), settings.run.data.prefetch)
 
 
-def _padded_in_turn(
-    settings: Settings, scans: Iterable[LidarScan], imu: ImuFeed | None
-) -> Generator[ScanInput]:
-    last_end_ns, last_count, size = None, 0, 0
-    first: ScanInput | None = None
-    opened = False
-    to_search = not any(settings.values["initial"]["velocity"])
-    R_imu_lidar = Rotation.from_quat(settings.values["extrinsics"]["rotation"])
-    for index, scan in enumerate(scans):
-        start = time.perf_counter()
-        count = len(scan.points)
-        covered = is_covered(scan)
-        # an empty or torn scan among whole ones is not worth compiling a program of its own size
-        if count >= _STRAGGLER * last_count:
-            size = bucket_for(count, settings.config.lidar)
-        arrays = padded(scan, last_end_ns, settings.config.lidar, size)
-        samples = imu.batch(scan, last_end_ns) if imu else None
-        before = imu.before(scan) if imu and first is None else None
-        if covered:
-            nothing: Any = np.zeros(len(arrays.mask), np.bool_)
-            arrays = replace(arrays, mask=nothing)
-        usable = opened or sees_enough(arrays, settings)
-        velocity = None
-        if first is not None and not opened and usable and to_search:
-            interval = (scan.end_ns - first.end_ns) * 1e-9
-            velocity = first_velocity(first.scan, arrays, interval, first.before, samples, R_imu_lidar)
-        pad_ms = (time.perf_counter() - start) * 1e3
-        fed = ScanInput(
-            index,
-            scan.end_ns,
-            count,
-            covered,
-            usable,
-            arrays,
-            samples,
-            before,
-            velocity,
-            pad_ms,
-        )
-        opened = first is not None
-        first = first or (fed if usable else None)
-        yield fed
-        last_end_ns, last_count = scan.end_ns, count
+class StepsInTurn:
+    """Takes scans through a stepper, one at a time.
 
+    The result of the first usable scan comes with that of the second one, because only the second scan shows
+    how fast the vehicle was.
+    """
 
-def is_covered(scan: LidarScan) -> bool:
-    """Return whether nearly all points are so near that something covers the sensor."""
-    some = scan.points[:: max(1, len(scan.points) // 1000)]
-    return len(some) > 0 and bool(np.mean(np.linalg.norm(some, axis=1) < COVERED_M) > _COVERED_SHARE)
+    def __init__(self, stepper: Stepper, state: Any = None) -> None:
+        """Begin a run.
 
+        Args:
+            stepper: of the run.
+            state: after a usable scan before the first one here; it is consumed. None: the run is new.
+        """
+        self._stepper = stepper
+        self._state = state
+        self._opened = state is not None
+        self._held: tuple[ScanInput, Any, Any] | None = None
 
-def sees_enough(scan: Scan, settings: Settings) -> bool:
-    """Return whether a scan has the points in range that a match needs; a blocked sensor has none."""
-    lidar, needed = settings.values["lidar"], settings.values["registration"]["min_matches"]
-    squared = np.einsum("ij,ij->i", scan.points, scan.points)
-    in_range = (squared > lidar["min_range"] ** 2) & (squared < lidar["max_range"] ** 2) & scan.mask
-    return int(np.count_nonzero(in_range)) >= needed
+    def take(self, fed: ScanInput) -> Iterator[tuple[ScanInput, Any, Any]]:
+        """Yield scans with the state and the output after each; a state is consumed when the next is asked
+        for."""
+        state = self._state
+        if self._held is not None:
+            first, state, output = self._held
+            self._held = None
+            if fed.usable:
+                first = replace(first, begun_at=time.perf_counter())
+                state, output = reopened(self._stepper, state, output, first, fed)
+            yield first, state, output
+        fed = replace(fed, begun_at=time.perf_counter())
+        begins = fed.usable and not self._opened
+        if state is None or begins:
+            state = self._stepper.init(fed.before)
+        self._state, output = self._stepper.step(state, fed.scan, fed.imu)
+        if begins:
+            self._held, self._opened = (fed, self._state, output), True
+        else:
+            yield fed, self._state, output
+
+    def rest(self) -> Iterator[tuple[ScanInput, Any, Any]]:
+        """Yield the first usable scan where no other one came after it."""
+        if self._held is not None:
+            held, self._held = self._held, None
+            yield held
 
 
 def run_steps(
@@ -325,8 +289,7 @@ def run_steps(
 ) -> Iterator[tuple[ScanInput, Any, Any]]:
     """Yield each scan with the state and the output after it; the state is consumed by the next one.
 
-    The first usable scan is yielded when the second one is there: only that shows how fast the vehicle
-    was.
+    After an error or Ctrl-C the result that was kept back is yielded first.
 
     Args:
         stepper: of the run.
@@ -334,32 +297,14 @@ def run_steps(
         state: after a usable scan before these, from which to go on; it is consumed. None: these are the
             first ones.
     """
-    held: tuple[ScanInput, Any, Any] | None = None
-    opened = state is not None
+    steps = StepsInTurn(stepper, state)
     try:
         for fed in scan_inputs:
-            if held is not None:
-                first, state, output = held
-                held = None
-                if fed.usable:
-                    first = replace(first, begun_at=time.perf_counter())
-                    state, output = reopened(stepper, state, output, first, fed)
-                yield first, state, output
-            fed = replace(fed, begun_at=time.perf_counter())
-            begins = fed.usable and not opened
-            if state is None or begins:
-                state = stepper.init(fed.before)
-            state, output = stepper.step(state, fed.scan, fed.imu)
-            if begins:
-                held, opened = (fed, state, output), True
-            else:
-                yield fed, state, output
+            yield from steps.take(fed)
     except (KeyboardInterrupt, Exception):
-        if held is not None:
-            yield held
+        yield from steps.rest()
         raise
-    if held is not None:
-        yield held
+    yield from steps.rest()
 
 
 _BEAMS_EVERY = 50
@@ -380,12 +325,6 @@ def beams_of(scan: Scan) -> int:
 
 _EVERY_POINT = 7
 """One point of so many is looked at for the beams: no divisor of their number, or some would be left out."""
-
-
-COVERED_M, _COVERED_SHARE = 1.0, 0.95
-"""A scan shows nothing but a cover if this share of its points is nearer than this distance, m."""
-_STRAGGLER = 0.25
-"""A scan with less than this share of the points of the scan before keeps that one's padded size."""
 
 
 _SHOWN_POINTS = 5000

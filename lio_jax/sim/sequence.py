@@ -33,6 +33,17 @@ from lio_jax.sim.worlds import Counts, Part, Scene, World, counts_along, nearest
 EPOCH_NS = 1_700_000_000_000_000_000
 """Absolute time of the recording's start, ns."""
 
+
+def _default_extrinsic() -> NDArray[np.float64]:
+    default = np.eye(4)
+    default[:3, :3] = Rotation.from_euler("xyz", [0.6, -1.2, 2.5], degrees=True).as_matrix()
+    default[:3, 3] = [0.1, 0.0, 0.2]
+    return default
+
+
+DEFAULT_T_IMU_LIDAR = _default_extrinsic()
+"""Pose of the lidar in the IMU frame where none is given, (4, 4): a small lever arm and rotation."""
+
 _TRUTH_STEP_NS = 10_000_000
 _POSES_AT_ONCE = 4096
 _STANDSTILL = 1.5
@@ -289,10 +300,7 @@ def _span(trajectory: Trajectory) -> float:
 def _extrinsic(T_imu_lidar: NDArray[np.floating[Any]] | None) -> NDArray[np.float64]:
     """Return the (4, 4) extrinsic as given, or the default."""
     if T_imu_lidar is None:
-        default = np.eye(4)
-        default[:3, :3] = Rotation.from_euler("xyz", [0.6, -1.2, 2.5], degrees=True).as_matrix()
-        default[:3, 3] = [0.1, 0.0, 0.2]
-        return default
+        return DEFAULT_T_IMU_LIDAR.copy()
     matrix = np.asarray(T_imu_lidar, np.float64)
     rotation = matrix[:3, :3]
     if matrix.shape != (4, 4) or not (

@@ -10,7 +10,8 @@ from lio_jax.core.types import state_dtype
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.run.run import check_start, imu_feed
-from lio_jax.run.track import ScanInput, scan_inputs
+from lio_jax.run.scan_inputs import ScanInput
+from lio_jax.run.track import scan_inputs
 from lio_jax.settings.settings import Settings
 from lio_jax.tuning.objectives import TruePose
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lio_jax.run.run import settings_for
-from lio_jax.run.track import ScanInput
+from lio_jax.run.scan_inputs import ScanInput
 from lio_jax.settings.settings import Settings, declared_settings, recipe_settings, with_overrides
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence

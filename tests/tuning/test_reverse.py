@@ -13,7 +13,7 @@ import pytest
 
 from lio_jax.core.types import NavState, Scan, initial_nav_state
 from lio_jax.recipes import recipe
-from lio_jax.run.track import ScanInput
+from lio_jax.run.scan_inputs import ScanInput
 from lio_jax.tuning.objectives import TruePose
 from lio_jax.tuning.parameters import free_parameters
 from lio_jax.tuning.reverse import TotalGradient, checkpointed_gradient
