@@ -15,6 +15,7 @@ from lio_jax.ablation.ranking import VariantComparison, cells, header, number
 from lio_jax.ablation.spec import METRICS, TIME
 from lio_jax.ablation.store import Store
 from lio_jax.run.folder import write_text
+from lio_jax.viz.html import CONTENT_POLICY
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -151,6 +152,7 @@ def report(comparison: VariantComparison, store: Store) -> str:
     head = (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f'<link rel="icon" href="data:,">{CONTENT_POLICY}'
         f"<title>{escape(spec.name)}</title><style>{_STYLE}</style></head>"
     )
     return f"{head}<body>{''.join(parts)}</body></html>\n"

@@ -157,8 +157,16 @@ def _short(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list):
-        return f"[{','.join(_short(item) for item in value)}]"
-    return str(value)
+        return _cut(f"[{','.join(_short(item) for item in value)}]")
+    return _cut(str(value))
+
+
+_LONGEST_VALUE = 200
+
+
+def _cut(text: str) -> str:
+    """Return the beginning of a value that no line of a table has room for; a damaged file may hold one."""
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."
 
 
 def resolve_settings(

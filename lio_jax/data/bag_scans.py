@@ -1,6 +1,6 @@
 """Turn point-cloud messages into LidarScans, after recognising the layout from a topic's first messages."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.timestamps import ns_to_seconds
 from lio_jax.data import pointcloud2
-from lio_jax.data.bag_files import Topic, why
+from lio_jax.data.bag_files import Topic, until_damage, why
 from lio_jax.data.config import DataConfig
 from lio_jax.data.point_time import PointTiming, TimeSample, recognise_point_time, scan_period, stamp_end
 from lio_jax.data.pointcloud2 import RawCloud, decode_pointcloud2
@@ -95,7 +95,7 @@ class ScanReading:
 def recognise_scans(
     reader: "AnyReader",
     topic: Topic,
-    messages: Iterable[tuple[Any, int, bytes]],
+    messages: Iterator[tuple[Any, int, bytes]],
     config: DataConfig,
     where: str,
 ) -> ScanReading:
@@ -104,7 +104,8 @@ def recognise_scans(
     Args:
         reader: the open bag.
         topic: the topic of the point clouds.
-        messages: (connection, receipt time in ns, bytes) of each message of the topic, in order.
+        messages: (connection, receipt time in ns, bytes) of each message of the topic, in order; they may end
+            in damage.
         config: settings that override what is recognised.
         where: name of bag and topic in errors.
 
@@ -116,7 +117,8 @@ def recognise_scans(
     samples: list[TimeSample] = []
     beams: list[int] = []
     kind = reason = ""
-    for _, received_ns, raw in messages:
+    damage: list[str] = []
+    for _, received_ns, raw in until_damage(messages, damage.append):
         try:
             cloud = decode_cloud(reader, topic, raw, config.time_field, where)
         except ValueError as error:
@@ -136,6 +138,7 @@ def recognise_scans(
         if len(headers) == _SCANS_LOOKED_AT:
             break
     if first is None:
+        reason = reason or "".join(f" ({cause})" for cause in damage)
         raise LioJaxError(
             f"{where}: no point cloud can be read{reason}; the recording is empty or damaged there."
         )

@@ -67,7 +67,7 @@ class RosbagSequence:
             self._lidar = self._choose_lidar(topics)
             self._imu_topic = self._choose("imu_topic", config.imu_topic, topics, _IMU_TYPES)
             self._gps_topic = self._choose_gps(topics)
-            messages = until_damage(self._messages(reader, self._lidar), lambda reason: None)
+            messages = self._messages(reader, self._lidar)
             self._reading = recognise_scans(reader, self._lidar, messages, config, self._where)
             self._T_imu_lidar = self._extrinsic(reader, topics)
         self._notes.extend(self._reading.notes)

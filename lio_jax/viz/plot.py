@@ -35,15 +35,17 @@ def plot_trajectory(path_png: Path, estimate: Trajectory, truth: Trajectory | No
         path_png: file to write, complete or not at all.
         estimate: T_world_body, z up, at least one pose.
         truth: true poses of the same body frame, in any world.
-        title: title of the picture.
+        title: title of the picture, plain text.
     """
     figure = _figure(12.0, 6.5)
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)
     try:
         matched = None if truth is None else match_by_time(estimate, truth, "the estimate", "the truth")
     except LioJaxError as reason:
         matched = None
-        figure.supxlabel(fill(f"Truth is not shown. {reason}", 120), fontsize="small", color="tab:red")
+        figure.supxlabel(
+            fill(f"Truth is not shown. {reason}", 120), fontsize="small", color="tab:red", parse_math=False
+        )
     grid = figure.add_gridspec(2, 2, width_ratios=(1.35, 1.0))
     top = figure.add_subplot(grid[:, 0])
     height = figure.add_subplot(grid[:, 1] if matched is None else grid[0, 1])
@@ -245,10 +247,10 @@ def plot_allan(path_png: Path, noises: Mapping[str, Noise], title: str) -> None:
     Args:
         path_png: file to write, complete or not at all.
         noises: noise analyses by name and unit.
-        title: title of the picture.
+        title: title of the picture, plain text.
     """
     figure = _figure(6.0 * len(noises), 5.0)
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)
     for axes, (name, noise) in zip(np.ravel(figure.subplots(1, len(noises))), noises.items(), strict=True):
         fit = noise.combined
         for axis, colour in enumerate(("tab:red", "tab:green", "tab:blue")):
