@@ -16,6 +16,7 @@ from lio_jax.ablation.spec import METRICS, TIME
 from lio_jax.ablation.store import Store
 from lio_jax.run.folder import write_text
 from lio_jax.viz.html import CONTENT_POLICY
+from lio_jax.viz.plot import letters_may_lack
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -111,7 +112,8 @@ def _uri(figure: "Figure") -> str:
 
     buffer = io.BytesIO()
     # equal results give equal bytes
-    with rc_context({"svg.hashsalt": "lio_jax", "svg.fonttype": "none", "font.family": "sans-serif"}):
+    style = {"svg.hashsalt": "lio_jax", "svg.fonttype": "none", "font.family": "sans-serif"}
+    with rc_context(style), letters_may_lack():
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()
 

@@ -61,8 +61,8 @@ def parse_yaml(text: str) -> Any:
     """
     if len(text) > _MOST_CHARACTERS:
         raise ValueError(f"it is longer than {_MOST_CHARACTERS} characters")
-    loader = _Loader(text)
     try:
+        loader = _Loader(text)
         node = loader.get_single_node()
         # counted before values are made: a merge key (<<) copies what its aliases stand for
         if _checked_size(node, {}) > _MOST_NODES:
@@ -75,8 +75,6 @@ def parse_yaml(text: str) -> Any:
     # yaml reads tagged values such as !!timestamp 9 by functions that raise exceptions of many kinds
     except Exception as error:
         raise ValueError(f"a value cannot be read: {' '.join(str(error).split())}") from None
-    finally:
-        loader.dispose()
 
 
 class _Loader(yaml.SafeLoader):

@@ -1,6 +1,8 @@
 """Plots by matplotlib: trajectories, times, tunings and Allan deviations."""
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Protocol
@@ -123,8 +125,16 @@ def _figure(width: float, height: float) -> "Figure":
 def _save(figure: "Figure", path_png: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    with atomic_path(path_png) as aside:
+    with atomic_path(path_png) as aside, letters_may_lack():
         FigureCanvasAgg(figure).print_png(str(aside))
+
+
+@contextmanager
+def letters_may_lack() -> Iterator[None]:
+    """Let pictures show a box for a letter that the font lacks, without a warning."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        yield
 
 
 def _seconds(trajectory: Trajectory, origin: Trajectory) -> NDArray[np.float64]:

@@ -191,11 +191,22 @@ def each_ten_times(first: str, entry: str) -> str:
         ("[" + "1," * 2000 + "1]", "too many values"),
         ("# " + "x" * 1_000_000, "longer than 1000000 characters"),
         ("a: &a [*a]", "within itself"),
+        ("a: \0", "special characters are not allowed"),
         ("[" * 900, "too deeply"),
         ("a: 1" + ":1" * 100_000, "a number of 200001 characters"),
         ("a: 0x" + "1" * 100_000, "a number of 100002 characters"),
     ],
-    ids=["aliases", "merged aliases", "values", "characters", "itself", "depth", "sexagesimal", "digits"],
+    ids=[
+        "aliases",
+        "merged aliases",
+        "values",
+        "characters",
+        "itself",
+        "letters",
+        "depth",
+        "sexagesimal",
+        "digits",
+    ],
 )
 def test_a_yaml_text_that_would_take_all_time_or_memory_is_refused(text, reason, monkeypatch):
     # a text with as many values as are allowed takes seconds
