@@ -415,3 +415,8 @@ def test_records_of_a_bag_that_contradict_each_other(accepted, tmp_path):
     path.write_bytes(data)
     warnings = accepted(*to_native(path))
     assert any("the bag is damaged" in line for line in warnings)
+
+
+def test_inertial_samples_whose_squares_are_beyond_all_numbers(accepted, native):
+    changed(native / "imu.npz", accel=np.full((COUNT, 3), 1e300))
+    accepted("inspect", native, "--json")
