@@ -229,7 +229,13 @@ def run_into(
         if isinstance(result.interruption, KeyboardInterrupt):
             say("interrupted: finishing the files of what was computed ...")
     result.metrics["notes"] = [*sequence.info.notes, *notes]
-    evaluation_text = _finish(result, truth, settings, out, info.name)
+    evaluation_text = ""
+    try:
+        evaluation_text = _finish(result, truth, settings, out, info.name)
+    except Exception:
+        # a file that the run could not write is the cause of what cannot be drawn
+        if result.interruption is None:
+            raise
     _warn(result.metrics["warnings"])
     _warn(result.metrics["verdict"]["reasons"])
     _warn([failure["message"] for failure in result.metrics["failures"]])
@@ -362,6 +368,12 @@ def _raise_if_interrupted(result: RunResult, out: Path, resumable: bool) -> None
     error = result.interruption
     if error is None:
         return
+    if isinstance(error, OSError) and error.strerror:
+        # an error in write(), for example on a full disk, names no file
+        place = error.filename or out
+        raise LioJaxError(
+            f"{place}: {error.strerror}; check the path, its permissions and the free space."
+        ) from error
     done = f"the first {result.metrics['scans']} scans are in {out}"
     if error in result.unfinished:
         raise error

@@ -174,11 +174,19 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
     The temporary path keeps the suffix, because some writers choose their format by it. It is removed if the
     block raises.
+
+    Raises:
+        OSError: the block met an error of the file system; if that named no file, as on a full disk, it names
+            ``path``.
     """
     aside = aside_of(path)
     try:
         yield aside
         os.replace(aside, path)
+    except OSError as error:
+        if error.errno is None or error.filename not in (None, str(aside), aside):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         aside.unlink(missing_ok=True)
 
