@@ -105,3 +105,15 @@ def test_a_chunk_of_declared_exabytes_takes_no_memory(tmp_path):
     with pytest.raises(LioJaxError, match=r"a\.mcap|/a: "):
         RosbagSequence(path, AUTO)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 18
+
+
+def test_names_in_a_bag_are_no_paths_to_write_to(tmp_path, monkeypatch):
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    path = compressed_file(tmp_path)
+    metadata = (path / "metadata.yaml").read_text()
+    (path / "metadata.yaml").write_text(metadata.replace("a.db3.zstd", "../../a.db3.zstd"))
+    before = sorted(tmp_path.rglob("*"))
+    assert "../../" in (path / "metadata.yaml").read_text()
+    assert len(list(RosbagSequence(path, AUTO).scans())) == 3
+    assert sorted(tmp_path.rglob("*")) == before
