@@ -112,8 +112,10 @@ def _uri(figure: "Figure") -> str:
 
     buffer = io.BytesIO()
     # equal results give equal bytes
-    style = {"svg.hashsalt": "lio_jax", "svg.fonttype": "none", "font.family": "sans-serif"}
-    with rc_context(style), letters_may_lack():
+    with (
+        rc_context({"svg.hashsalt": "lio_jax", "svg.fonttype": "none", "font.family": "sans-serif"}),
+        letters_may_lack(),
+    ):
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()
 
