@@ -21,16 +21,19 @@ from experiments.fuzz.edits import Edit
 from experiments.fuzz.kinds import KINDS, Kind
 from experiments.fuzz.seeds import write_seeds
 from experiments.fuzz.verdicts import ACCEPTED, FAILURES, REFUSED, Done, Verdict, judge
-from experiments.fuzz.worker import resident_bytes
+from experiments.fuzz.worker import computing_s, resident_bytes
 
 MOST_BYTES = 2 << 30
 """Memory that a command may take beyond what its process held before, bytes."""
 SILENCE_S = 20.0
-"""Time after which a command that has printed nothing further counts as hanging, s."""
+"""Computing time after which a command that has printed nothing further counts as hanging, s."""
+_LONGEST_WAIT_S = 120.0
+"""Time after which it counts as hanging even if it computed less, s: a busy machine gives it a share only."""
 _LOOK_S = 0.02
 _MOST_KEPT = 4 << 30
 """Memory of a worker after which it is replaced before its next command, bytes."""
-_START_S = 120.0
+_COMPILING_S = 600.0
+"""Both times for the commands that make the seeds, s: they compile programs."""
 
 
 class Worker:
@@ -40,8 +43,14 @@ class Worker:
         self._work = work
         self._process: subprocess.Popen[str] | None = None
 
-    def run(self, words: list[str], allowed: Path) -> Done:
-        """Run one command, which may write to the folder ``allowed`` only."""
+    def run(self, words: list[str], allowed: Path, silence_s: float = SILENCE_S) -> Done:
+        """Run one command, which may write to the folder ``allowed`` only.
+
+        Args:
+            words: of the command line.
+            allowed: the folder.
+            silence_s: computing time after which the command hangs if it has printed nothing, s.
+        """
         process = self._started()
         files = {name: self._work / f"worker.{name}" for name in ("out", "err")}
         before = resident_bytes(process.pid)
@@ -58,7 +67,7 @@ class Worker:
         try:
             process.stdin.write(json.dumps(job) + "\n")
             process.stdin.flush()
-            ended = self._wait(process, list(files.values()), before)
+            ended = self._wait(process, list(files.values()), before, silence_s)
             line = "" if ended else process.stdout.readline()
         except BrokenPipeError:
             ended, line = "", ""
@@ -111,13 +120,19 @@ class Worker:
                     "OMP_NUM_THREADS": "1",
                 },
             )
+            # the libraries are imported now, which is no time of the first command
+            assert self._process.stdout is not None
+            self._process.stdout.readline()
         return self._process
 
-    def _wait(self, process: subprocess.Popen[str], outputs: list[Path], before: int) -> str:
+    def _wait(
+        self, process: subprocess.Popen[str], outputs: list[Path], before: int, silence_s: float
+    ) -> str:
         """Wait for the report; return why the command had to be ended, "" if it had not."""
         import select
 
-        sizes, changed = -1, time.monotonic()
+        sizes, changed, computed = -1, 0.0, 0.0
+        longest_s = max(silence_s, _LONGEST_WAIT_S)
         while True:
             readable, _, _ = select.select([process.stdout], [], [], _LOOK_S)
             if readable:
@@ -128,8 +143,8 @@ class Worker:
                 return self._end(process, "memory")
             now = sum(path.stat().st_size for path in outputs)
             if now != sizes:
-                sizes, changed = now, time.monotonic()
-            elif time.monotonic() - changed > SILENCE_S:
+                sizes, changed, computed = now, time.monotonic(), computing_s(process.pid)
+            elif time.monotonic() - changed > longest_s or computing_s(process.pid) - computed > silence_s:
                 return self._end(process, "hang")
 
     @staticmethod
@@ -210,7 +225,7 @@ class Trial:
         self._work.mkdir(parents=True, exist_ok=True)
 
         def run(words: list[str]) -> int:
-            done = self.worker.run(words, self._work)
+            done = self.worker.run(words, self._work, _COMPILING_S)
             return 1 if done.status is None else done.status
 
         write_seeds(self._seeds, run, with_run)

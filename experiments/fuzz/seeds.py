@@ -140,6 +140,8 @@ def write_seeds(root: Path, run: Run, with_run: bool) -> None:
     (root / "rest").mkdir()
     still = _imu(4000)
     np.savez(root / "rest" / "imu.npz", stamp_ns=still.stamp_ns, gyro=still.gyro, accel=still.accel)
+    # its programs are compiled before its time counts
+    must("inspect", native, "--json")
     if with_run:
         # the back end writes keyframes and a corrected trajectory
         less = ("config.backend.loops=true", "config.output.recording=false", "config.output.plot=false")

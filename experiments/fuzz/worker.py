@@ -1,7 +1,8 @@
 """A process that runs commands of ``lio-jax`` one after another, and reports what each one did.
 
-It keeps the package imported, so that a command takes milliseconds. A job is a line of JSON on standard input
-and its report one on standard output; the command's own output goes to the job's files.
+It keeps the package imported, so that a command takes milliseconds. It says in a line that it is ready.
+Then a job is a line of JSON on standard input and its report one on standard output; the own output of the
+command goes to the files of the job.
 """
 
 import json
@@ -53,6 +54,16 @@ def resident_bytes(process: int | str = "self", peak: bool = False) -> int:
     return next((int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith(name)), 0)
 
 
+def computing_s(process: int) -> float:
+    """Return the time that a process has computed on all cores together, s; 0 for one that has ended."""
+    try:
+        # the name of the program, in parentheses, may hold spaces
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def run_job(job: dict[str, Any], watch: Watch) -> dict[str, Any]:
     """Run one command with its output in files, and return the report."""
     caches = (os.environ["LIO_JAX_CACHE"], tempfile.gettempdir(), "/dev/null")
@@ -89,6 +100,8 @@ def serve() -> None:
     watch = Watch()
     sys.addaudithook(watch)
     with os.fdopen(os.dup(1), "w") as reports:
+        reports.write("ready\n")
+        reports.flush()
         for line in sys.stdin:
             reports.write(json.dumps(run_job(json.loads(line), watch)) + "\n")
             reports.flush()

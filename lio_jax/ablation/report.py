@@ -15,6 +15,8 @@ from lio_jax.ablation.ranking import VariantComparison, cells, header, number
 from lio_jax.ablation.spec import METRICS, TIME
 from lio_jax.ablation.store import Store
 from lio_jax.run.folder import write_text
+from lio_jax.viz.html import CONTENT_POLICY
+from lio_jax.viz.plot import letters_may_lack
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -110,7 +112,10 @@ def _uri(figure: "Figure") -> str:
 
     buffer = io.BytesIO()
     # equal results give equal bytes
-    with rc_context({"svg.hashsalt": "lio_jax", "svg.fonttype": "none", "font.family": "sans-serif"}):
+    with (
+        rc_context({"svg.hashsalt": "lio_jax", "svg.fonttype": "none", "font.family": "sans-serif"}),
+        letters_may_lack(),
+    ):
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()
 
@@ -151,6 +156,7 @@ def report(comparison: VariantComparison, store: Store) -> str:
     head = (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f'<link rel="icon" href="data:,">{CONTENT_POLICY}'
         f"<title>{escape(spec.name)}</title><style>{_STYLE}</style></head>"
     )
     return f"{head}<body>{''.join(parts)}</body></html>\n"

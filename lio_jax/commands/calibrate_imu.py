@@ -115,8 +115,9 @@ def _from_npz(path: Path) -> ImuData:
         arrays.setdefault("stamp_ns", np.round(np.arange(count) * (1e9 / float(arrays["rate_hz"]))))
     if missing := [key for key in ("stamp_ns", "gyro", "accel") if key not in arrays]:
         raise LioJaxError(f"{path}: holds no {', '.join(missing)}; give a native imu.npz.")
-    if not np.isfinite(arrays["stamp_ns"]).all():
-        raise LioJaxError(f"{path}: stamp_ns is not finite; give a native imu.npz.")
+    stamps = np.asarray(arrays["stamp_ns"])
+    if not (np.isfinite(stamps) & (np.abs(stamps.astype(np.float64)) < 2.0**63)).all():
+        raise LioJaxError(f"{path}: stamp_ns holds times beyond 64 bits of ns; give a native imu.npz.")
     stamps = arrays["stamp_ns"].astype(np.int64)
     gyro, accel = (np.asarray(arrays[key], np.float64) for key in ("gyro", "accel"))
     if stamps.ndim != 1 or gyro.shape != (len(stamps), 3) or accel.shape != (len(stamps), 3):

@@ -157,8 +157,16 @@ def _short(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list):
-        return f"[{','.join(_short(item) for item in value)}]"
-    return str(value)
+        return _cut(f"[{','.join(_short(item) for item in value)}]")
+    return _cut(str(value))
+
+
+_LONGEST_VALUE = 200
+
+
+def _cut(text: str) -> str:
+    """Return the beginning of a value that no line of a table has room for; a damaged file may hold one."""
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."
 
 
 def resolve_settings(
@@ -221,7 +229,13 @@ def run_into(
         if isinstance(result.interruption, KeyboardInterrupt):
             say("interrupted: finishing the files of what was computed ...")
     result.metrics["notes"] = [*sequence.info.notes, *notes]
-    evaluation_text = _finish(result, truth, settings, out, info.name)
+    evaluation_text = ""
+    try:
+        evaluation_text = _finish(result, truth, settings, out, info.name)
+    except Exception:
+        # a file that the run could not write is the cause of what cannot be drawn
+        if result.interruption is None:
+            raise
     _warn(result.metrics["warnings"])
     _warn(result.metrics["verdict"]["reasons"])
     _warn([failure["message"] for failure in result.metrics["failures"]])
@@ -354,6 +368,12 @@ def _raise_if_interrupted(result: RunResult, out: Path, resumable: bool) -> None
     error = result.interruption
     if error is None:
         return
+    if isinstance(error, OSError) and error.strerror:
+        # an error in write(), for example on a full disk, names no file
+        place = error.filename or out
+        raise LioJaxError(
+            f"{place}: {error.strerror}; check the path, its permissions and the free space."
+        ) from error
     done = f"the first {result.metrics['scans']} scans are in {out}"
     if error in result.unfinished:
         raise error

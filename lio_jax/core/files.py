@@ -24,6 +24,14 @@ _DAMAGES = (KeyError, EOFError, MemoryError, RuntimeError, struct.error, zipfile
 """What a damaged .npz file may raise in addition to ValueError."""
 _MOST_NODES = 100_000
 """Largest number of values in a YAML text, with aliases written out: a few lines can stand for billions."""
+_MOST_CHARACTERS = 1_000_000
+"""Longest YAML text: a longer one takes a minute or more to read."""
+_MOST_DIGITS = 1_000
+"""Longest number in a YAML text: the time to read one grows with the square of its length."""
+_NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
+_UNPACKED_BYTES, _UNPACKED_RATIO = 1 << 28, 100
+"""Arrays may fill so many bytes, or so many times the size of their .npz file, whichever is more: a file of
+megabytes can unpack to all the memory there is."""
 
 
 def read_text(path: Path, remedy: str, error: type[LioJaxError] = LioJaxError) -> str:
@@ -48,13 +56,18 @@ def parse_yaml(text: str) -> Any:
     """Return the value that a YAML text holds.
 
     Raises:
-        ValueError: it is not YAML, or its aliases stand for too many values; the message is one line.
+        ValueError: it is not YAML, is too long, or its aliases stand for too many values; the message is one
+            line.
     """
+    if len(text) > _MOST_CHARACTERS:
+        raise ValueError(f"it is longer than {_MOST_CHARACTERS} characters")
     try:
-        tree = yaml.safe_load(text)
-        if _nodes(tree, {}) > _MOST_NODES:
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        # counted before values are made: a merge key (<<) copies what its aliases stand for
+        if _checked_size(node, {}) > _MOST_NODES:
             raise ValueError("it holds too many values")
-        return tree
+        return None if node is None else loader.construct_document(node)
     except RecursionError:
         raise ValueError("it is nested too deeply, or within itself") from None
     except yaml.YAMLError as error:
@@ -64,12 +77,35 @@ def parse_yaml(text: str) -> Any:
         raise ValueError(f"a value cannot be read: {' '.join(str(error).split())}") from None
 
 
-def _nodes(node: Any, known: dict[int, int]) -> int:
-    """Return the number of values in a tree, counting what an alias repeats each time."""
+class _Loader(yaml.SafeLoader):
+    """Stops in the middle of a text that holds too many values."""
+
+    _composed = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        self._composed += 1
+        if self._composed > _MOST_NODES:
+            raise ValueError("it holds too many values")
+        return super().compose_node(parent, index)
+
+
+def _checked_size(node: yaml.Node | None, known: dict[int, int]) -> int:
+    """Return the number of values in a tree, counting what an alias repeats each time.
+
+    Raises:
+        ValueError: a number has too many digits.
+    """
+    if node is None:
+        return 0
     if id(node) not in known:
-        children = [*node, *node.values()] if isinstance(node, dict) else node
-        children = children if isinstance(node, dict | list) else ()
-        known[id(node)] = 1 + sum(_nodes(child, known) for child in children)
+        if node.tag in _NUMBERS and len(node.value) > _MOST_DIGITS:
+            raise ValueError(f"a number of {len(node.value)} characters")
+        children: list[yaml.Node] = []
+        if isinstance(node, yaml.MappingNode):
+            children = [one for pair in node.value for one in pair]
+        elif isinstance(node, yaml.SequenceNode):
+            children = node.value
+        known[id(node)] = 1 + sum(_checked_size(child, known) for child in children)
     return known[id(node)]
 
 
@@ -87,9 +123,22 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             if isinstance(file, np.ndarray):
                 raise ValueError("it holds one array and is no .npz archive")
             with file:
+                _check_unpacked(file.zip, path.stat().st_size)
                 return {name: file[name] for name in file.files}
         except _DAMAGES as error:
             raise ValueError(str(error) or "it is damaged") from None
+
+
+def _check_unpacked(archive: zipfile.ZipFile, size: int) -> None:
+    """Refuse an archive of ``size`` bytes whose arrays would fill far more memory than that.
+
+    Raises:
+        ValueError: it is such an archive.
+    """
+    # zipfile reads no more of a member than its entry states
+    unpacked = sum(entry.file_size for entry in archive.infolist())
+    if unpacked > max(_UNPACKED_BYTES, _UNPACKED_RATIO * size):
+        raise ValueError(f"its {size} bytes would unpack to {unpacked}, as no recording does")
 
 
 def array_of(
@@ -125,11 +174,19 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
     The temporary path keeps the suffix, because some writers choose their format by it. It is removed if the
     block raises.
+
+    Raises:
+        OSError: the block met an error of the file system; if that named no file, as on a full disk, it names
+            ``path``.
     """
     aside = aside_of(path)
     try:
         yield aside
         os.replace(aside, path)
+    except OSError as error:
+        if error.errno is None or error.filename not in (None, str(aside), aside):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         aside.unlink(missing_ok=True)
 

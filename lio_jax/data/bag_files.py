@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lio_jax.core.errors import LioJaxError
+from lio_jax.data.decompression import limit_rosbags
 from lio_jax.data.static_transforms import register_type
 
 if TYPE_CHECKING:
@@ -188,6 +189,7 @@ def open_bag(paths: Sequence[Path]) -> Iterator["AnyReader"]:
 
     typestore = get_typestore(Stores.ROS2_HUMBLE)
     register_type(typestore)
+    limit_rosbags()
     try:
         reader = AnyReader(list(paths), default_typestore=typestore)
         reader.open()

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.data.pointcloud2 import valid_returns
+from lio_jax.data.cloud_fields import valid_returns
 from lio_jax.data.sequence import LidarScan
 
 _POINT = np.dtype(

@@ -12,7 +12,15 @@ from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import array_of, parse_yaml, read_arrays, read_text
 from lio_jax.data.cloud_fields import valid_returns
 from lio_jax.data.config import DataConfig
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
+from lio_jax.data.sequence import (
+    GpsData,
+    ImuData,
+    LidarScan,
+    Reader,
+    SequenceInfo,
+    WarningLog,
+    check_still_there,
+)
 from lio_jax.data.time_order import Stamped, in_time_order
 from lio_jax.data.trajectory import Trajectory, are_rigid, read_tum
 from lio_jax.data.velodyne_file import listed_runs, missing_runs, numbered_files
@@ -115,6 +123,7 @@ class NativeSequence:
         try:
             return _scan_of(read_arrays(path), self._compensated)
         except (OSError, ValueError, KeyError) as error:
+            check_still_there(path)
             self._log.add(f"{path}: cannot be read ({error}), the scan was skipped.")
             return None
 

@@ -1,6 +1,7 @@
 """What a recording is, one protocol for all formats; what a reader is; and scans decoded ahead on a
 thread."""
 
+import os
 import queue
 import threading
 from collections.abc import Callable, Generator, Iterator
@@ -213,6 +214,23 @@ class Reader:
     """The fields of DataConfig that change what is read."""
     has_parts: bool = True
     """Whether the paths inside such a recording are parts of it and no recordings themselves."""
+
+
+def check_still_there(path: Path) -> None:
+    """Raise an error if a file cannot be read because its whole folder is gone, as on a lost network drive.
+
+    Args:
+        path: of the file of a recording that was open before.
+
+    Raises:
+        LioJaxError: the folder is gone.
+    """
+    try:
+        os.stat(path.parent)
+    except OSError as error:
+        raise LioJaxError(
+            f"{path.parent}: is gone while it was read ({error.strerror}); check the disk or the network."
+        ) from None
 
 
 def entries(folder: Path) -> list[Path]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lio_jax.data.cloud_fields import valid_returns
 from lio_jax.data.config import DataConfig
 from lio_jax.data.reconstruct import ring_from_azimuth_wraps, ring_from_elevation
+from lio_jax.data.sequence import check_still_there
 
 _BYTES_PER_POINT = 16
 _HDL64_BEAMS = 64
@@ -60,10 +61,14 @@ def read_returns(path: Path, warn: Callable[[str], None]) -> NDArray[np.float32]
 
     NaN, infinite and zero points are dropped. An empty file gives an empty scan, and a truncated file gives
     its whole points, both with a warning. A file that cannot be read at all gives None with a warning.
+
+    Raises:
+        LioJaxError: the whole folder is gone.
     """
     try:
         rows = _read_text(path, warn) if path.suffix == ".txt" else _read_binary(path, warn)
     except (OSError, ValueError) as error:
+        check_still_there(path)
         warn(f"{path}: cannot be read ({error}), the scan was skipped.")
         return None
     valid = valid_returns(rows)

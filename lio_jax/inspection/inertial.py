@@ -127,7 +127,9 @@ def _rhythm(parts: list[ImuData]) -> tuple[float | None, float | None, int, floa
 
 
 def _magnitude(parts: list[ImuData]) -> float | None:
-    strength = np.concatenate([np.linalg.norm(part.accel, axis=1) for part in parts])
+    accel = np.concatenate([part.accel for part in parts])
+    # squares of what no sensor measures may be beyond all numbers
+    strength = np.linalg.norm(accel[(np.abs(accel) < LARGEST).all(axis=1)], axis=1)
     strength = strength[strength < LARGEST]
     return float(np.median(strength)) if len(strength) else None
 

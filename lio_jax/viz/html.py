@@ -10,6 +10,13 @@ from html import escape
 SERIES = 8
 """Number of distinct colours of series; further series use them again from the first."""
 
+CONTENT_POLICY = (
+    '<meta http-equiv="Content-Security-Policy" content="'
+    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
+    '">'
+)
+"""Element of a page's head: the browser runs no script of the page, and loads nothing but pictures in it."""
+
 _STYLE = """
 :root { color-scheme: light dark; --paper: #fff; --ink: #1d2327; --soft: #5d6770; --line: #d5dbe0;
   --card: #f5f7f8; --bad: #b3261e;
@@ -64,10 +71,8 @@ def page(title: str, sections: Iterable[str]) -> str:
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        # the browser asks the server for no icon, and only data of this page may be shown
-        '<link rel="icon" href="data:,">'
-        '<meta http-equiv="Content-Security-Policy" '
-        "content=\"default-src 'none'; style-src 'unsafe-inline'; img-src data:\">"
+        # the browser asks the server for no icon
+        f'<link rel="icon" href="data:,">{CONTENT_POLICY}'
         f"<title>{escape(title)}</title><style>{_STYLE}</style></head>\n<body>\n<h1>{escape(title)}</h1>\n"
         + "\n".join(part for part in sections if part)
         + "\n</body></html>\n"

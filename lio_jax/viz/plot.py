@@ -1,6 +1,8 @@
 """Plots by matplotlib: trajectories, times, tunings and Allan deviations."""
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Protocol
@@ -35,15 +37,17 @@ def plot_trajectory(path_png: Path, estimate: Trajectory, truth: Trajectory | No
         path_png: file to write, complete or not at all.
         estimate: T_world_body, z up, at least one pose.
         truth: true poses of the same body frame, in any world.
-        title: title of the picture.
+        title: title of the picture, plain text.
     """
     figure = _figure(12.0, 6.5)
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)
     try:
         matched = None if truth is None else match_by_time(estimate, truth, "the estimate", "the truth")
     except LioJaxError as reason:
         matched = None
-        figure.supxlabel(fill(f"Truth is not shown. {reason}", 120), fontsize="small", color="tab:red")
+        figure.supxlabel(
+            fill(f"Truth is not shown. {reason}", 120), fontsize="small", color="tab:red", parse_math=False
+        )
     grid = figure.add_gridspec(2, 2, width_ratios=(1.35, 1.0))
     top = figure.add_subplot(grid[:, 0])
     height = figure.add_subplot(grid[:, 1] if matched is None else grid[0, 1])
@@ -121,8 +125,16 @@ def _figure(width: float, height: float) -> "Figure":
 def _save(figure: "Figure", path_png: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    with atomic_path(path_png) as aside:
+    with atomic_path(path_png) as aside, letters_may_lack():
         FigureCanvasAgg(figure).print_png(str(aside))
+
+
+@contextmanager
+def letters_may_lack() -> Iterator[None]:
+    """Let pictures show a box for a letter that the font lacks, without a warning."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        yield
 
 
 def _seconds(trajectory: Trajectory, origin: Trajectory) -> NDArray[np.float64]:
@@ -245,10 +257,10 @@ def plot_allan(path_png: Path, noises: Mapping[str, Noise], title: str) -> None:
     Args:
         path_png: file to write, complete or not at all.
         noises: noise analyses by name and unit.
-        title: title of the picture.
+        title: title of the picture, plain text.
     """
     figure = _figure(6.0 * len(noises), 5.0)
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)
     for axes, (name, noise) in zip(np.ravel(figure.subplots(1, len(noises))), noises.items(), strict=True):
         fit = noise.combined
         for axis, colour in enumerate(("tab:red", "tab:green", "tab:blue")):

@@ -109,7 +109,7 @@ def headline(run: RunRecord) -> dict[str, str]:
 def _opening(run: RunRecord) -> str:
     recording: dict[str, Any] = run.metrics.get("recording", {})
     words = [recording.get("format", ""), recording.get("sensor", ""), recording.get("path", "")]
-    summary = ", ".join(word for word in words if word)
+    summary = ", ".join(str(word) for word in words if word)
     return f"{summary}. Motion predicted by {run.metrics.get('prediction', 'unknown')}." if summary else ""
 
 

@@ -415,3 +415,15 @@ def test_records_of_a_bag_that_contradict_each_other(accepted, tmp_path):
     path.write_bytes(data)
     warnings = accepted(*to_native(path))
     assert any("the bag is damaged" in line for line in warnings)
+
+
+def test_inertial_samples_whose_squares_are_beyond_all_numbers(accepted, native):
+    changed(native / "imu.npz", accel=np.full((COUNT, 3), 1e300))
+    accepted("inspect", native, "--json")
+
+
+def test_stamps_beyond_64_bits(refused, tmp_path):
+    stamps = np.arange(COUNT) * 1e300
+    np.savez(tmp_path / "imu.npz", stamp_ns=stamps, gyro=np.ones((COUNT, 3)), accel=np.ones((COUNT, 3)))
+    sentence = refused("calibrate-imu", tmp_path / "imu.npz", "--out", tmp_path / "out.yaml")
+    assert f"{tmp_path / 'imu.npz'}: stamp_ns holds times beyond 64 bits of ns" in sentence

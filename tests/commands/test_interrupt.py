@@ -112,7 +112,7 @@ def test_bug_in_the_middle(cli, tmp_path, monkeypatch):
     _check_complete(tmp_path / "out", 5)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_to_a_real_process(tmp_path, number):
     """Send it once the map's spool has begun to grow."""
     many = islice(cycle(standing()), SCANS)

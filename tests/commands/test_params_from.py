@@ -95,3 +95,10 @@ def test_a_wrong_file_ends_with_usage(folder, cli, tmp_path):
     done = cli("run", folder, "--params-from", wrong, "--out", tmp_path / "out")
     assert done.status == 2
     assert f"{wrong}: holds no parameters" in done.err
+
+
+def test_a_value_of_thousands_of_characters_is_cut_in_the_table(cli, theirs, tmp_path):
+    theirs.write_text(theirs.read_text().replace("N_SCAN: 16", f"N_SCAN: 16\n  unknown: '{'9' * 5000}'"))
+    done = cli("run", tmp_path / "nowhere", "--params-from", theirs, "--out", tmp_path / "out")
+    (line,) = (line for line in done.err.splitlines() if "unknown" in line)
+    assert len(line) < 400

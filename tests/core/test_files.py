@@ -1,13 +1,16 @@
 """A file appears whole or not at all."""
 
 import os
+import resource
+import zipfile
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lio_jax.core.files import aside_of, atomic_path, folder_lock, read_arrays, remove_leftovers
+from lio_jax.core.files import aside_of, atomic_path, folder_lock, parse_yaml, read_arrays, remove_leftovers
 
 
 def test_file_appears_when_the_block_ends(tmp_path):
@@ -145,3 +148,83 @@ def test_objects_are_not_unpickled(tmp_path):
     np.savez(tmp_path / "a.npz", evil=np.array([{}], object))
     with pytest.raises(ValueError, match="allow_pickle"):
         read_arrays(tmp_path / "a.npz")
+
+
+def test_arrays_that_would_unpack_to_far_more_than_their_file_are_refused(tmp_path, monkeypatch):
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, points=np.zeros(1 << 20))
+    assert read_arrays(path)["points"].shape == (1 << 20,)
+    monkeypatch.setattr("lio_jax.core.files._UNPACKED_BYTES", 1 << 20)
+    with pytest.raises(ValueError, match="would unpack to 8388"):
+        read_arrays(path)
+    np.savez(path, points=np.zeros(1 << 20))
+    assert read_arrays(path)["points"].shape == (1 << 20,)
+
+
+@pytest.mark.parametrize("count", [1 << 36, 1 << 44, 1 << 60])
+def test_an_array_of_declared_terabytes_is_refused(tmp_path, count):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive, archive.open("points.npy", "w") as member:
+        np.lib.format.write_array_header_1_0(
+            member, {"descr": "<f4", "fortran_order": False, "shape": (count,)}
+        )
+        member.write(bytes(1000))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ValueError, match=r"."):
+        read_arrays(tmp_path / "a.npz")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 18
+
+
+def each_ten_times(first: str, entry: str) -> str:
+    """Return a YAML text of eight values, each of which holds the one before it ten times."""
+    names = "abcdefgh"
+    lines = [f"a: &a {first}"]
+    for before, name in pairwise(names):
+        lines.append(f"{name}: &{name} {entry.format(', '.join([f'*{before}'] * 10))}")
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (each_ten_times("[x]", "[{}]"), "too many values"),
+        (each_ten_times("{x: 1}", "{{<<: [{}]}}"), "too many values"),
+        ("[" + "1," * 2000 + "1]", "too many values"),
+        ("# " + "x" * 1_000_000, "longer than 1000000 characters"),
+        ("a: &a [*a]", "within itself"),
+        ("a: \0", "special characters are not allowed"),
+        ("[" * 900, "too deeply"),
+        ("a: 1" + ":1" * 100_000, "a number of 200001 characters"),
+        ("a: 0x" + "1" * 100_000, "a number of 100002 characters"),
+    ],
+    ids=[
+        "aliases",
+        "merged aliases",
+        "values",
+        "characters",
+        "itself",
+        "letters",
+        "depth",
+        "sexagesimal",
+        "digits",
+    ],
+)
+def test_a_yaml_text_that_would_take_all_time_or_memory_is_refused(text, reason, monkeypatch):
+    # a text with as many values as are allowed takes seconds
+    monkeypatch.setattr("lio_jax.core.files._MOST_NODES", 1000)
+    with pytest.raises(ValueError, match=reason):
+        parse_yaml(text)
+
+
+def test_yaml_with_aliases_and_merged_keys_is_read():
+    assert parse_yaml("a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}\nc: [*a, *a]") == {
+        "a": {"x": 1, "y": 2},
+        "b": {"x": 1, "y": 3},
+        "c": [{"x": 1, "y": 2}] * 2,
+    }
+    assert parse_yaml("") is None
+    assert parse_yaml("a: 1.5e3\nb: 12:30") == {"a": "1.5e3", "b": 750}
+
+
+def test_yaml_tags_make_no_objects():
+    with pytest.raises(ValueError, match="could not determine a constructor"):
+        parse_yaml("!!python/object/apply:os.getcwd []")

@@ -123,3 +123,9 @@ def test_pyplot_is_not_imported(tmp_path):
     command = [sys.executable, "-c", code, str(tmp_path / "t.png")]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.parametrize("name", [r"run $1 and $\frac{", "маршрут 测试", "line\nbreak"])
+def test_any_name_is_a_title(tmp_path, drawn, name):
+    plot_trajectory(tmp_path / "a.png", stamped(straight_drive()), None, name)
+    assert drawn[0].get_suptitle() == name

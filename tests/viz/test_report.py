@@ -264,3 +264,10 @@ def test_a_version_that_is_a_number_is_shown(tmp_path):
     metrics = json.loads((run / "metrics.json").read_text()) | {"environment": {"jaxlib": 123456}}
     (run / "metrics.json").write_text(json.dumps(metrics))
     assert "123456" in write_report(run).read_text()
+
+
+def test_a_description_of_another_type_is_shown(tmp_path):
+    run = write_run(tmp_path / "run")
+    metrics = json.loads((run / "metrics.json").read_text()) | {"recording": {"format": ["a bag"], "path": 3}}
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    assert "a bag" in write_report(run).read_text()

@@ -19,6 +19,7 @@ from lio_jax.core.errors import LioJaxError
 from lio_jax.viz import viewer
 from lio_jax.viz.recording import ViewerRecording
 from lio_jax.viz.viewer import served
+from tests.network import check_loopback_only
 from tests.viz.browser import needs_browser, seen
 
 
@@ -55,6 +56,7 @@ def test_a_recording_is_served_on_loopback_and_no_longer_than_the_block(tmp_path
         if Path("/proc/self/net/tcp").exists():
             # 127.0.0.1 and nothing else
             assert [listening(port) for port in ports] == [{"0100007F"}] * 2
+        check_loopback_only({("127.0.0.1", port) for port in ports})
     for port in ports:
         with socket.socket() as probe:
             assert probe.connect_ex(("127.0.0.1", port)) != 0
