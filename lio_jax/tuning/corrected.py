@@ -177,7 +177,8 @@ class CorrectedLoss:
 
     def values(self, xs: NDArray[np.float64], recording: Recording) -> NDArray[np.float64]:
         """Return the objective of one recording at each row of ``xs``."""
-        return np.array([self(x, [recording]).value for x in xs])
+        run = self.run_over(recording)
+        return np.array([corrected_value(run, self._free, self._objective, jnp.asarray(x)) for x in xs])
 
     def run_over(self, recording: Recording) -> CorrectedRun:
         """Return the run over a recording, which is made once."""
@@ -209,13 +210,26 @@ def corrected_gradient(
     return float(value.value), np.asarray(value.dot, np.float64)
 
 
+def corrected_value(run: CorrectedRun, free: ParameterVector, objective: Objective, x: Array) -> float:
+    """Return the objective of :func:`corrected_gradient` without its derivative."""
+    poses = np.asarray(run.replayed.corrected(free(x)))
+    arrays, static = split_objective(objective)
+    add = programs(_add, static)
+    total = objective.start()
+    for pose, seen, truth in zip(poses, run.seen, run.truth, strict=True):
+        total = add(arrays, total, pose, seen, truth)
+    return float(objective.value(total))
+
+
 def _add_with_tangents(
     static: Any, arrays: Any, sums: Dual, pose: Dual, seen: Observed, truth: TruePose
 ) -> Dual:
+    return push_forward(lambda sums, numbers: _add(static, arrays, sums, numbers, seen, truth), sums, pose)
+
+
+def _add(
+    static: Any, arrays: Any, sums: Any, numbers: Float[Array, "7"], seen: Observed, truth: TruePose
+) -> Any:
     objective: Objective = eqx.combine(arrays, static)
-
-    def add(sums: Any, numbers: Float[Array, "7"]) -> Any:
-        moved = eqx.tree_at(lambda seen: seen.nav.T_world_imu, seen, jaxlie.SE3(numbers))
-        return objective.add(sums, moved, truth)
-
-    return push_forward(add, sums, pose)
+    moved = eqx.tree_at(lambda seen: seen.nav.T_world_imu, seen, jaxlie.SE3(numbers))
+    return objective.add(sums, moved, truth)
