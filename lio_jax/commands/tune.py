@@ -105,7 +105,7 @@ def tune(
         # where points lie changes a loss by little, and every value of it changes choices
         moved = through_map and all(declared.moves_points for declared in free.declared)
         optimiser = "scoring" if named.likelihood else "stationary" if moved else "lbfgsb"
-    loss = (
+    loss: Loss | CorrectedLoss = (
         CorrectedLoss(settings, free, named.objective)
         if corrected
         else Loss(settings.recipe, settings.config, free, named.objective, through_map, named.likelihood)

@@ -269,7 +269,8 @@ def _judged(
     elif rival > limits["rival"]:
         reason = f"another fit agrees with {rival:.2f} of the points that agree with the best"
     to_body = np.kron(np.eye(2), poses[1, :3, :3])
-    information, stated = np.zeros((6, 6)), None
+    information = np.zeros((6, 6))
+    stated: _Array | None = None
     if not reason:
         stated = np.linalg.inv(_BELIEVED * to_body.T @ best.information @ to_body)
         information = _believed(stated, limits)

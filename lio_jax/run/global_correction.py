@@ -130,7 +130,7 @@ class GlobalCorrection(Sink):
         """What was found wrong with the fixes."""
         backend = settings.run.backend
         self._closer = LoopCloser(settings) if backend.loops else None
-        gate = None
+        gate: GpsGate | None = None
         if backend.gps:
             gate, self.notes = gps_gate(sequence, settings)
         self._settings, self._out, self._files = settings, out, files

@@ -6,6 +6,8 @@ weights and levers depend on the parameters, and whose solution has a derivative
 (:mod:`lio_jax.pose_graph.pose_derivative`).
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -120,13 +122,13 @@ def _weighted(replayed: ReplayedGraph, params: GlobalParams) -> PoseGraph:
 
 
 @jax.jit
-def _interpolated(replayed: ReplayedGraph, solved: Poses) -> Float[Array, "n 7"]:
+def _interpolated(replayed: ReplayedGraph, solved: Any) -> Float[Array, "n 7"]:
     """Return the corrected poses as :func:`lio_jax.loops.back_end.corrected_poses` does."""
     if replayed.aligned:
         solved = _levelled(solved, replayed.keyframes) @ solved
     T_world_odom = solved @ replayed.keyframes.inverse()
-    seen_before = picked(T_world_odom, replayed.before) @ replayed.odometry
-    seen_after = picked(T_world_odom, replayed.after) @ replayed.odometry
+    seen_before: Any = picked(T_world_odom, replayed.before) @ replayed.odometry
+    seen_after: Any = picked(T_world_odom, replayed.after) @ replayed.odometry
     share = replayed.share[:, None]
     turn = (seen_before.rotation().inverse() @ seen_after.rotation()).log()
     rotation = seen_before.rotation() @ jaxlie.SO3.exp(share * turn)
