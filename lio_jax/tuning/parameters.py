@@ -25,7 +25,7 @@ class ParameterVector(eqx.Module):
     times Exp(x), rad.
     """
 
-    start: Any
+    start: eqx.Module
     """A tree of parameters, a recipe's or the back end's: those where ``x`` is :meth:`first`. Leaves that are
     not tuned keep these values."""
     paths: tuple[str, ...] = eqx.field(static=True)
@@ -80,7 +80,7 @@ class ParameterVector(eqx.Module):
 
 
 def free_parameters(
-    start: Any, patterns: tuple[str, ...] | list[str], rings: Callable[[], int] | None = None
+    start: eqx.Module, patterns: tuple[str, ...] | list[str], rings: Callable[[], int] | None = None
 ) -> ParameterVector:
     """Return the parameters that the patterns name.
 
@@ -134,23 +134,23 @@ def _choice(paths: list[str]) -> str:
     return "those that can be tuned: " + ", ".join(paths) + "."
 
 
-def _may_start(start: Any, path: str) -> bool:
+def _may_start(start: eqx.Module, path: str) -> bool:
     value = _leaf(start, path)
     return value.size > 0 and (_tuned(start, path) != "log" or bool(value > 0))
 
 
-def _has_no_rings(start: Any, path: str) -> bool:
+def _has_no_rings(start: eqx.Module, path: str) -> bool:
     return settings_of(type(start))[path].declared.per_ring and not _leaf(start, path).size
 
 
-def _with_zeros(start: Any, paths: list[str], count: int) -> Any:
+def _with_zeros(start: eqx.Module, paths: list[str], count: int) -> Any:
     def leaves(params: Any) -> list[Array]:
         return [_leaf(params, path) for path in paths]
 
     return eqx.tree_at(leaves, start, [jnp.zeros(count, value.dtype) for value in leaves(start)])
 
 
-def _tuned(start: Any, path: str) -> Tuned | None:
+def _tuned(start: eqx.Module, path: str) -> Tuned | None:
     return settings_of(type(start))[path].declared.tuned
 
 
@@ -159,7 +159,7 @@ def _leaf(params: Any, path: str) -> Array:
     return getattr(getattr(params, section), name)
 
 
-def _component_names(start: Any, path: str) -> tuple[str, ...]:
+def _component_names(start: eqx.Module, path: str) -> tuple[str, ...]:
     if settings_of(type(start))[path].declared.per_ring:
         return tuple(f"{path}.{ring}" for ring in range(len(_leaf(start, path))))
     if _leaf(start, path).ndim:
@@ -167,14 +167,14 @@ def _component_names(start: Any, path: str) -> tuple[str, ...]:
     return (path,)
 
 
-def _encoded(start: Any, path: str) -> Float[Array, " k"]:
+def _encoded(start: eqx.Module, path: str) -> Float[Array, " k"]:
     value, tuned = _leaf(start, path), _tuned(start, path)
     if tuned == "turn":
         return jnp.zeros(3, value.dtype)
     return jnp.atleast_1d(jnp.log(value) if tuned == "log" else value)
 
 
-def _decoded(start: Any, path: str, x: Float[Array, " k"]) -> Array:
+def _decoded(start: eqx.Module, path: str, x: Float[Array, " k"]) -> Array:
     value, tuned = _leaf(start, path), _tuned(start, path)
     if tuned == "turn":
         turned = jaxlie.SO3.from_quaternion_xyzw(value) @ jaxlie.SO3.exp(x)
