@@ -254,8 +254,13 @@ def tune(
     params: Annotated[str, arg(metavar="GLOB,...")],
     out: Annotated[Path, arg(metavar="DIR")],
     objective: Annotated[
-        str, arg(metavar="NAME", help=f"One of {LISTED}, or a sum such as {EXAMPLE}; marginal needs lio_sam.")
-    ] = "noise",
+        str | None,
+        arg(
+            metavar="NAME",
+            help=f"One of {LISTED}, or a sum such as {EXAMPLE}; marginal needs lio_sam. None means noise, or "
+            "ate for parameters of loops and GPS.",
+        ),
+    ] = None,
     recipe: Recipe = None,
     set_: Assignments = (),
     params_from: ParamsFrom = None,
@@ -274,7 +279,8 @@ def tune(
 
     Args:
         data: Recordings to tune on.
-        params: Parameters, for example imu.gyro_noise,imu.accel_noise or extrinsics.*.
+        params: Parameters, for example imu.gyro_noise,imu.accel_noise, extrinsics.*, or loop.*,gps.* with the
+            back end.
         out: Folder for tuned.yaml, history.json and tuning.png; an earlier tuning there is continued.
         recipe: Recipe or settings file to start from; None as for run.
         validate: Recordings that decide which iterate is taken and when to stop.

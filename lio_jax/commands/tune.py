@@ -19,6 +19,7 @@ from lio_jax.data.detect import open_sequence
 from lio_jax.run.fitted_settings import ring_count
 from lio_jax.run.run import settings_for
 from lio_jax.settings.settings import Settings
+from lio_jax.tuning.corrected import CorrectedLoss, free_of_back_end, names_back_end
 from lio_jax.tuning.gradient import Loss, wants_map
 from lio_jax.tuning.objective_names import LIKELIHOODS, SHORT
 from lio_jax.tuning.objectives import Named, objective_named
@@ -40,8 +41,10 @@ REACH = {
     "range_offset": 0.5,
     "ring_range_offset": 0.5,
     "range_scale": math.log(1.2),
+    "lever_arm": 3.0,
 }
-"""Largest change of parameters that move the points, from their start: rad, m, s, and of a logarithm."""
+"""Largest change of parameters that move the points or the antenna, from their start: rad, m, s, and of a
+logarithm."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,8 @@ class TuneOptions:
     assignments: tuple[str, ...]
     params_from: Path | None
     params: str
-    objective: str
+    objective: str | None
+    """None: ``noise``, or ``ate`` for parameters of the back end."""
     optimiser: Optimiser
     iterations: int
     patience: int
@@ -73,30 +77,43 @@ def tune(
         LioJaxError: a recording cannot be read, or the objective is not finite at the start.
     """
     _check(options, data, gt)
-    named = objective_named(options.objective)
+    base = resolve_settings(options.recipe, options.assignments, options.params_from)
+    patterns = [word.strip() for word in options.params.split(",") if word.strip()]
+    corrected = names_back_end(patterns, base)
+    objective = options.objective or ("ate" if corrected else "noise")
+    named, options = objective_named(objective), replace(options, objective=objective)
     optimiser = options.optimiser
     if optimiser == "scoring" and not named.likelihood:
         raise UsageError(
             f"--optimizer scoring wants a likelihood ({', '.join([*SHORT, *LIKELIHOODS])}), "
             f"not {options.objective}."
         )
-    base = resolve_settings(options.recipe, options.assignments, options.params_from)
-    patterns = [word.strip() for word in options.params.split(",") if word.strip()]
     rings = partial(_rings_of, data[0], base)
-    free_parameters(base.params(), patterns, rings)
+
+    def free_in(settings: Settings) -> ParameterVector:
+        if corrected:
+            return free_of_back_end(settings, patterns, named)
+        return free_parameters(settings.params(), patterns, rings)
+
+    free_in(base)
     settings, training = _recordings(data, base, gt, named, options, options.segment)
     _, validation = _recordings(validate, settings, None, named, replace(options, start=0, scans=None), None)
-    free = free_parameters(settings.params(), patterns, rings)
+    free = free_in(settings)
     _prepare(out, options.overwrite)
-    through_map = wants_map(named, free)
+    through_map = not corrected and wants_map(named, free)
     if optimiser == "auto":
         # where points lie changes a loss by little, and every value of it changes choices
         moved = through_map and all(declared.moves_points for declared in free.declared)
         optimiser = "scoring" if named.likelihood else "stationary" if moved else "lbfgsb"
+    loss: Loss | CorrectedLoss = (
+        CorrectedLoss(settings, free, named.objective)
+        if corrected
+        else Loss(settings.recipe, settings.config, free, named.objective, through_map, named.likelihood)
+    )
     session = Session(
         out,
         free,
-        Loss(settings.recipe, settings.config, free, named.objective, through_map, named.likelihood),
+        loss,
         training,
         validation,
         named.likelihood,

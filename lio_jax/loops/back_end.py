@@ -116,6 +116,9 @@ class Edge:
     that of the coordinates in world."""
     lever: _Array | None = None
     """(3,) point whose position is measured, in the frame of j, m; None: the origin."""
+    stated: _Array | None = None
+    """(6, 6) part of the covariance that does not depend on the parameters, see
+    :mod:`lio_jax.loops.edge_noise`; None: no part of it depends on them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,7 +321,8 @@ class BackEnd:
             last = self._keyframes[-1]
             T_last_this = _inverse(last.T_odom_imu) @ pose
             information = _inverse(keyframe.covariance)
-            self._edges.append(Edge(ODOMETRY, last.index, keyframe.index, T_last_this, information))
+            ends = last.index, keyframe.index
+            self._edges.append(Edge(ODOMETRY, *ends, T_last_this, information, stated=keyframe.stated))
             pose = self._poses[-1] @ T_last_this
             self._since_fix = carried(self._since_fix, _inverse(T_last_this)) + keyframe.covariance
         self._keyframes.append(keyframe)
@@ -329,7 +333,8 @@ class BackEnd:
         entering = closer.take(self._keyframes, self._poses)
         for verdict in entering:
             ends = verdict.proposal.target, verdict.proposal.source
-            self._edges.append(Edge(LOOP, *ends, verdict.T_target_source, verdict.information))
+            measured = verdict.T_target_source, verdict.information
+            self._edges.append(Edge(LOOP, *ends, *measured, stated=verdict.stated))
         self._unsolved += len(entering)
         return len(held_by(self._poses, entering)) < len(entering)
 
@@ -390,10 +395,11 @@ class BackEnd:
 
 
 def _position(index: int, fix: Fix, lever: _Array) -> Edge:
-    measured, information = np.eye(4), np.zeros((6, 6))
+    measured, information, stated = np.eye(4), np.zeros((6, 6)), np.zeros((6, 6))
     measured[:3, 3] = fix.position
     information[3:, 3:] = _inverse(fix.covariance)
-    return Edge(POSITION, index, index, measured, information, lever)
+    stated[3:, 3:] = fix.stated
+    return Edge(POSITION, index, index, measured, information, lever, stated)
 
 
 def _first_pose(T_enu_imu: _Array, tilt_sigma: float) -> Edge:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from lio_jax.core.xla import programs
+from lio_jax.loops.edge_noise import fix_covariance
 from lio_jax.pose_graph.graduated import truncated_weights
 
 _Array = NDArray[np.float64]
@@ -228,7 +229,9 @@ class Fix(NamedTuple):
     position: _Array
     """(3,) position in the fixes' frame, m: east, north, up."""
     covariance: _Array
-    """(3, 3) covariance of the position, m^2."""
+    """(3, 3) covariance of the position that is believed, m^2."""
+    stated: _Array
+    """(3, 3) covariance of the position that the receiver states, m^2."""
 
 
 class Refusal(StrEnum):
@@ -368,10 +371,11 @@ class GpsGate:
             share = away[0] / sum(away)
             weights = np.array([1 - share, share])
             # the errors of both are taken as equal, because they hardly change from one fix to the next
-            return Fix(weights @ self._position[around], np.tensordot(weights, self._covariance[around], 1))
+            stated = np.tensordot(weights, self._covariance[around], 1)
+            return Fix(weights @ self._position[around], stated, stated)
         nearest = around[int(np.argmin(away))]
-        missed = (self._speed * min(away)) ** 2
-        return Fix(self._position[nearest], self._covariance[nearest] + missed * np.eye(3))
+        stated = self._covariance[nearest] + (self._speed * min(away)) ** 2 * np.eye(3)
+        return Fix(self._position[nearest], stated, stated)
 
     def _one_way(self, around: list[int], seconds: float) -> bool:
         """Return whether the vehicle can have travelled from one fix to the next one."""
@@ -386,13 +390,11 @@ class GpsGate:
 
     def _trusted(self, fix: Fix, height: float) -> Fix:
         """Return the fix with at least the smallest allowed variance, and with the height that is used."""
-        position, covariance = fix.position.copy(), fix.covariance.copy()
+        position = fix.position.copy()
         if not self._elevation:
             position[2] = height
-            covariance[2, :] = covariance[:, 2] = 0.0
-            covariance[2, 2] = self._values["height_variance"]
-        lacking = np.maximum(self._values["min_variance"] - np.diag(covariance), 0.0)
-        return Fix(position, covariance + np.diag(lacking))
+        least = self._values["min_variance"], self._values["height_variance"]
+        return Fix(position, fix_covariance(fix.stated, self._elevation, *least), fix.stated)
 
     def _fits_most(self, witness: _Witness) -> bool:
         fitting = sum(self._fit(witness, other) for other in self._witnesses)

@@ -22,6 +22,10 @@ class Keyframe:
     covariance: NDArray[np.float64]
     """(6, 6) covariance of the pose's error since the previous keyframe: right perturbation, rotation (rad)
     before translation (m)."""
+    stated: NDArray[np.float64] | None = None
+    """(6, 6) the part of the covariance that the estimator states, see
+    :func:`lio_jax.loops.edge_noise.odometry_covariance`; None: the covariance does not depend on
+    ``params.backend``."""
     position_error: float = 0.0
     """Largest error of the position since the previous keyframe beyond the odometry's drift, m: where a new
     piece of map begins after an outage."""

@@ -17,10 +17,14 @@ from lio_jax.registration.params import GaussNewtonMatch, RobustMatch
 class BackendParams(eqx.Module):
     """How far the back end trusts the odometry."""
 
-    odometry_rotation_sigma: Scalar = leaf(1e-3, "rad", above=0)
-    """Standard deviation of the rotation from one keyframe to the next."""
-    odometry_translation_sigma: Scalar = leaf(1e-2, "m", above=0)
-    """Standard deviation of the translation from one keyframe to the next."""
+    odometry_scale: Scalar = leaf(3.0, above=0, tuned="log")
+    """Factor of the standard deviations that the estimator states for its error from one keyframe to the
+    next. They are added to the two below."""
+    odometry_rotation_sigma: Scalar = leaf(1e-3, "rad", above=0, tuned="log")
+    """Standard deviation of the rotation from one keyframe to the next that the estimator does not state."""
+    odometry_translation_sigma: Scalar = leaf(1e-2, "m", above=0, tuned="log")
+    """Standard deviation of the translation from one keyframe to the next that the estimator does not
+    state."""
     tilt_sigma: Scalar = leaf(0.1, "rad", above=0)
     """Standard deviation of the first keyframe's roll and pitch, where GPS ties the trajectory to the
     world."""
@@ -56,9 +60,9 @@ class LoopParams(eqx.Module):
     """Largest share of the map's upright surfaces that stand where the scan's rays passed through."""
     rival: Scalar = leaf(0.9, above=0, most=1)
     """No other alignment may reach more than this share of the best alignment's agreeing points."""
-    rotation_sigma: Scalar = leaf(0.005, "rad", least=0)
+    rotation_sigma: Scalar = leaf(0.005, "rad", least=0, tuned="log")
     """Smallest standard deviation of a loop's rotation."""
-    translation_sigma: Scalar = leaf(0.1, "m", least=0)
+    translation_sigma: Scalar = leaf(0.1, "m", least=0, tuned="log")
     """Smallest standard deviation of a loop's translation."""
     support_reach: Scalar = leaf(50.0, "m", above=0)
     """Two loops confirm or contradict each other if both ends are no farther apart than this, along the
@@ -68,7 +72,7 @@ class LoopParams(eqx.Module):
 class GpsParams(eqx.Module):
     """Which GPS fixes tie the trajectory to the earth, and how far they are trusted."""
 
-    lever_arm: Float[Array, "3"] = leaf((0.0, 0.0, 0.0), "m")
+    lever_arm: Float[Array, "3"] = leaf((0.0, 0.0, 0.0), "m", tuned="linear")
     """Position of the antenna in the IMU frame."""
     min_travel: Scalar = leaf(5.0, "m", least=0)
     """Fixes are used once the trajectory is this long."""
@@ -80,9 +84,9 @@ class GpsParams(eqx.Module):
     """The position is interpolated between two fixes that are no farther apart than this."""
     max_variance: Scalar = leaf(400.0, "m^2", above=0)
     """Fixes with a larger variance to the east or north are left out."""
-    min_variance: Scalar = leaf(1.0, "m^2", above=0)
+    min_variance: Scalar = leaf(1.0, "m^2", above=0, tuned="log")
     """Smallest variance of an axis that is believed, because consecutive errors of fixes are correlated."""
-    height_variance: Scalar = leaf(0.01, "m^2", above=0)
+    height_variance: Scalar = leaf(0.01, "m^2", above=0, tuned="log")
     """Variance of the height where the height is the odometry's and not the fix's."""
     spacing: Scalar = leaf(5.0, "m", least=0)
     """Keyframes nearer than this to the last keyframe with a fix get none."""

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.core.leaf import numbers_of, traced
 from lio_jax.loops.alignment import aligned
+from lio_jax.loops.edge_noise import loop_covariance
 from lio_jax.loops.keyframe import Keyframe, level_points, padded, same_piece, thinned
 from lio_jax.loops.overlap import LEAST_POINTS, Candidate, CloudComparison, conflict
 from lio_jax.loops.params import AlignmentParams, BackEndSettings
@@ -151,6 +152,9 @@ class Verdict:
     information: _Array
     """(6, 6) inverse covariance of its right perturbation, rotation (rad) before translation (m); zero if the
     loop was refused."""
+    stated: _Array | None = None
+    """(6, 6) the part of its covariance that the alignment states, see
+    :func:`lio_jax.loops.edge_noise.loop_covariance`; None if the loop was refused."""
     fitness: float = np.inf
     """Mean squared distance to the map of the points that have a counterpart there, m^2."""
     overlap: float = 0.0
@@ -266,8 +270,10 @@ def _judged(
         reason = f"another fit agrees with {rival:.2f} of the points that agree with the best"
     to_body = np.kron(np.eye(2), poses[1, :3, :3])
     information = np.zeros((6, 6))
+    stated: _Array | None = None
     if not reason:
-        information = _believed(to_body.T @ best.information @ to_body, limits)
+        stated = np.linalg.inv(_BELIEVED * to_body.T @ best.information @ to_body)
+        information = _believed(stated, limits)
     left, right = np.eye(4), np.eye(4)
     left[:3, :3], right[:3, :3] = poses[0, :3, :3].T, poses[1, :3, :3]
     return Verdict(
@@ -276,6 +282,7 @@ def _judged(
         reason or f"{best.overlap:.2f} of the points agree",
         left @ best.T_target_source @ right,
         information,
+        stated,
         best.fitness,
         best.overlap,
         against,
@@ -293,11 +300,10 @@ def refused(proposal: Proposal, reason: str) -> Verdict:
     return Verdict(proposal, False, reason, proposal.T_target_source, np.zeros((6, 6)))
 
 
-def _believed(information: _Array, limits: Mapping[str, Any]) -> _Array:
-    """Return the information reduced for correlated errors."""
-    sigmas = np.repeat([limits["rotation_sigma"], limits["translation_sigma"]], 3)
-    believed = np.linalg.inv(np.linalg.inv(_BELIEVED * information) + np.diag(sigmas**2))
-    return (believed + believed.T) / 2
+def _believed(stated: _Array, limits: Mapping[str, Any]) -> _Array:
+    """Return the information of a loop whose alignment states a covariance."""
+    believed = np.linalg.inv(loop_covariance(stated, limits["rotation_sigma"], limits["translation_sigma"]))
+    return np.asarray((believed + believed.T) / 2)
 
 
 def _level(T_target_source: _Array, T_world_target: _Array, T_world_source: _Array) -> _Array:

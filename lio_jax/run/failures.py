@@ -156,6 +156,20 @@ def failure_of(now: ScanEvidence, before: ScanEvidence | None, settings: Setting
     return " ".join([first, *(sentence[0].upper() + sentence[1:] for sentence in more)])
 
 
+def only_leaves_open(output: Any) -> bool:
+    """Return whether a scan was matched and leaves directions open, along which its pose is the prediction.
+
+    The covariance of the estimator contains the error along them.
+
+    Args:
+        output: of the scan's step.
+    """
+    found = output.registration
+    matched = not bool(output.lost) and int(found.status) == CONVERGED
+    restarted = output.restarted is not None and bool(output.restarted)
+    return matched and not restarted and bool(np.any(np.asarray(found.degenerate)))
+
+
 def longest_gap(samples: ImuBatch, start: float, end: float) -> float:
     """Return the longest time without a sample that overlaps an interval, s.
 

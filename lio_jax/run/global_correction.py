@@ -89,6 +89,28 @@ _KEPT_SPACING = 0.4
 """Spacing of the points that keyframes keep in memory for loops, m. On disk they keep all points."""
 
 
+def gps_gate(sequence: Sequence, settings: Settings) -> tuple[GpsGate, tuple[str, ...]]:
+    """Return the choice of a recording's fixes, and what was found wrong with them.
+
+    Raises:
+        LioJaxError: the recording holds no fixes.
+    """
+    recorded = sequence.gps()
+    if recorded is None or not len(recorded.stamp_ns):
+        raise LioJaxError(
+            f"{sequence.info.path}: holds no GPS fixes; leave config.backend.gps=true out, or name their "
+            "topic by config.data.gps_topic."
+        )
+    gps, notes = cleaned(recorded, "GPS")
+    elevation = settings.run.backend.gps_elevation
+    return GpsGate(gps.stamp_ns, gps.position, gps.covariance, settings.values["gps"], elevation), notes
+
+
+def light(keyframe: Keyframe) -> Keyframe:
+    """Return a keyframe with the points that loops need."""
+    return replace(keyframe, points=thinned(keyframe.points, _KEPT_SPACING))
+
+
 class GlobalCorrection(Sink):
     """Corrects the trajectory and the map in a thread of its own, while the odometry goes on."""
 
@@ -108,7 +130,9 @@ class GlobalCorrection(Sink):
         """What was found wrong with the fixes."""
         backend = settings.run.backend
         self._closer = LoopCloser(settings) if backend.loops else None
-        gate = self._gate(sequence, settings) if backend.gps else None
+        gate: GpsGate | None = None
+        if backend.gps:
+            gate, self.notes = gps_gate(sequence, settings)
         self._settings, self._out, self._files = settings, out, files
         self._origin = sequence.gps().origin if gate else None  # type: ignore[union-attr]
         self._picker, self._store = KeyframePicker(settings), KeyframeWriter(out)
@@ -119,7 +143,7 @@ class GlobalCorrection(Sink):
         keyframe = self._picker(result)
         if keyframe is not None:
             self._store.append(keyframe.points, corner_marks(result))
-            self._thread.add(replace(keyframe, points=thinned(keyframe.points, _KEPT_SPACING)))
+            self._thread.add(light(keyframe))
 
     def finish(self, run: RunResult) -> None:
         """Write the corrected results and hand them over; what waits still counts unless the run was ended.
@@ -150,17 +174,6 @@ class GlobalCorrection(Sink):
     def close(self) -> None:
         """Let the back end's thread end."""
         self._thread.stop()
-
-    def _gate(self, sequence: Sequence, settings: Settings) -> GpsGate:
-        recorded = sequence.gps()
-        if recorded is None or not len(recorded.stamp_ns):
-            raise LioJaxError(
-                f"{sequence.info.path}: holds no GPS fixes; leave config.backend.gps=true out, or name their "
-                "topic by config.data.gps_topic."
-            )
-        gps, self.notes = cleaned(recorded, "GPS")
-        elevation = settings.run.backend.gps_elevation
-        return GpsGate(gps.stamp_ns, gps.position, gps.covariance, settings.values["gps"], elevation)
 
     def _of_all_stored(
         self, found: Correction, odometry: Trajectory, poses: NDArray[np.float64]

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import array_of, atomic_path, read_arrays
 from lio_jax.core.geometry import carried
+from lio_jax.loops.edge_noise import odometry_covariance, stated_growth
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.pose_graph.g2o import G2oEdge
-from lio_jax.run.failures import BridgedOutage
+from lio_jax.run.failures import BridgedOutage, only_leaves_open
 from lio_jax.run.track import ScanResult
 from lio_jax.settings.settings import Settings
 
@@ -29,9 +30,11 @@ class KeyframePicker:
     def __init__(self, settings: Settings) -> None:
         sigmas, output = settings.values["backend"], settings.run.output
         self._distance, self._angle = output.keyframe_distance, output.keyframe_angle
-        rotation, translation = sigmas["odometry_rotation_sigma"], sigmas["odometry_translation_sigma"]
-        self._covariance = np.diag([rotation**2] * 3 + [translation**2] * 3)
+        self._sigmas = tuple(
+            sigmas[f"odometry_{name}"] for name in ("rotation_sigma", "translation_sigma", "scale")
+        )
         self._last: Keyframe | None = None
+        self._last_covariance: NDArray[np.float64] | None = None
         self._failed = False
         self.stamps_ns: list[int] = []
         """Stamps of the keyframes so far, ns."""
@@ -41,29 +44,54 @@ class KeyframePicker:
     def __call__(self, tracked: ScanResult) -> Keyframe | None:
         """Return the scan as a keyframe, or None if it is not one.
 
-        The covariance between two keyframes is that of ``params.backend``. It is large if a scan between them
-        failed, and that of the pose where a new piece of map begins. A scan that was not matched gives a pose
-        without points: where the points are is not known.
+        The covariance between two keyframes is what the estimator's covariance grows by, and the variances of
+        ``params.backend``. It is large if a scan between them failed, and that of the pose where a new piece
+        of map begins. A scan that leaves directions open did not fail: the estimator's covariance grows along
+        these directions. A scan that was not matched gives a pose without points: where the points are is not
+        known.
         """
         T, outage = tracked.T_world_imu, tracked.outage
-        self._failed |= bool(tracked.failure)
+        covariance = _pose_covariance(tracked)
+        known = covariance is not None and only_leaves_open(tracked.output)
+        self._failed |= bool(tracked.failure) and not known
         moved = self._last is None or is_keyframe(self._last.T_odom_imu, T, self._distance, self._angle)
         if not np.isfinite(T).all() or not (moved or outage):
             return None
         points = points_in_imu(tracked)
+        stated = None if outage or self._failed else self._stated_since_last(T, covariance)
+        unknown = _across(outage) if outage else _LOOSE
         self._last = Keyframe(
             index=0 if self._last is None else self._last.index + 1,
             stamp_ns=tracked.stamp_ns,
             T_odom_imu=T,
             points=points[:0] if bool(tracked.output.lost) and outage is None else points,
-            covariance=_across(outage) if outage else _LOOSE if self._failed else self._covariance,
+            covariance=unknown if stated is None else odometry_covariance(stated, *self._sigmas),
+            stated=stated,
             position_error=outage.position if outage else 0.0,
             heading_error=outage.heading if outage else 0.0,
         )
-        self._failed = False
+        self._last_covariance, self._failed = covariance, False
         self.stamps_ns.append(tracked.stamp_ns)
         self.pieces += [self._last.index] if outage else []
         return self._last
+
+    def _stated_since_last(
+        self, T_odom_imu: NDArray[np.float64], covariance: NDArray[np.float64] | None
+    ) -> NDArray[np.float64]:
+        """Return what the estimator states of a pose's error since the last keyframe, (6, 6)."""
+        before = self._last_covariance
+        if self._last is None or before is None or covariance is None:
+            return np.zeros((6, 6))
+        T_this_last = np.linalg.inv(T_odom_imu) @ self._last.T_odom_imu
+        return stated_growth(before, covariance, T_this_last)
+
+
+def _pose_covariance(tracked: ScanResult) -> NDArray[np.float64] | None:
+    """Return the covariance of the pose's right perturbation, (6, 6); None where it is not known."""
+    if tracked.output.covariance is None:
+        return None
+    covariance = np.array(tracked.output.covariance, np.float64)[:6, :6]
+    return covariance if np.isfinite(covariance).all() else None
 
 
 def _across(outage: BridgedOutage) -> NDArray[np.float64]:

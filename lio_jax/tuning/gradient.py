@@ -16,6 +16,8 @@ from lio_jax.recipes.params import RecipeConfig as Config
 from lio_jax.run.fitted_settings import ring_count
 from lio_jax.run.run import settings_for
 from lio_jax.settings.settings import Settings, recipe_of, recipe_settings
+from lio_jax.tuning.corrected import CorrectedLoss, free_of_back_end, names_back_end
+from lio_jax.tuning.evaluated import Evaluated
 from lio_jax.tuning.objectives import Named, Objective, objective_named
 from lio_jax.tuning.parameters import ParameterVector, free_parameters
 from lio_jax.tuning.recording import Recording
@@ -52,6 +54,10 @@ def gradient(
     The first call compiles; others with the same recipe, config, parameters' names and objective do not, in
     the same process.
 
+    With parameters of the back end (``loop.*``, ``gps.*``, ``backend.*``) it is that of the trajectory after
+    loops and GPS. The odometry and the choices of the back end are then constants, and ``mode`` and
+    ``through_map`` have no effect.
+
     Args:
         sequence: the recording.
         patterns: parameters by name or glob, such as ``imu.*_noise``.
@@ -73,16 +79,24 @@ def gradient(
     if mode not in ("auto", "forward", "reverse"):
         raise UsageError(f"mode '{mode}' is not known; there are: auto, forward, reverse.")
     resolved, _ = settings_for(sequence, settings or recipe_settings("default"))
-    free = free_parameters(resolved.params(), list(patterns), lambda: ring_count(sequence.scans()))
     named = objective_named(objective) if isinstance(objective, str) else Named(objective, False, False)
+    if names_back_end(patterns, resolved):
+        free = free_of_back_end(resolved, patterns, named)
+        recording = Recording(sequence, resolved, start, count, truth, keep=False)
+        found = CorrectedLoss(resolved, free, named.objective)(np.asarray(free.first()), [recording])
+        return NamedGradient(found.value, _by_name(free, found.gradient), (), False)
+    free = free_parameters(resolved.params(), list(patterns), lambda: ring_count(sequence.scans()))
     recipe = recipe_of(resolved)
     through_map = wants_map(named, free) if through_map is None else through_map
     recording = Recording(sequence, resolved, start, count, truth, keep=False)
     forward = mode == "forward" or (mode == "auto" and len(free.names) <= _MOST_FORWARD)
     differentiate = streaming_gradient if forward else checkpointed_gradient
     result = differentiate(recipe, free, named.objective, free.first(), recording, through_map=through_map)
-    by_name = dict(zip(free.names, result.gradient.tolist(), strict=True))
-    return NamedGradient(result.value, by_name, result.unconverged, through_map)
+    return NamedGradient(result.value, _by_name(free, result.gradient), result.unconverged, through_map)
+
+
+def _by_name(free: ParameterVector, gradient: NDArray[np.float64]) -> dict[str, float]:
+    return dict(zip(free.names, gradient.tolist(), strict=True))
 
 
 def wants_map(named: Named, free: ParameterVector) -> bool:
@@ -101,20 +115,6 @@ def wants_map(named: Named, free: ParameterVector) -> bool:
 
 _MOST_FORWARD = 32
 """Number of parameters up to which forward mode is taken."""
-
-
-@dataclass(frozen=True)
-class Evaluated:
-    """The loss at one vector of parameters."""
-
-    value: float
-    gradient: NDArray[np.float64]
-    """(p,)."""
-    scores: NDArray[np.float64] | None
-    """(n, p) each scan's share of the gradient of the sum over all scans; None by reverse mode."""
-    unconverged: int
-    """Scans whose solve did not converge: with many of them the gradient is not to be trusted."""
-    scans: int
 
 
 class Loss:

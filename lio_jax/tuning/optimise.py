@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.tuning.gradient import Evaluated
+from lio_jax.tuning.evaluated import Evaluated
 
 Vector = NDArray[np.float64]
 Evaluate = Callable[[Vector], Evaluated]

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from lio_jax.core.errors import UsageError
 from lio_jax.core.leaf import Declared, Tuned, settings_of
-from lio_jax.recipes.params import RecipeParams
 from lio_jax.recipes.transforms import Dual
 
 
@@ -26,8 +25,9 @@ class ParameterVector(eqx.Module):
     times Exp(x), rad.
     """
 
-    start: RecipeParams
-    """Where ``x`` is :meth:`first`; leaves that are not tuned keep these values."""
+    start: eqx.Module
+    """A tree of parameters, a recipe's or the back end's: those where ``x`` is :meth:`first`. Leaves that are
+    not tuned keep these values."""
     paths: tuple[str, ...] = eqx.field(static=True)
     """Leaves that are tuned, such as ``imu.gyro_noise``."""
 
@@ -49,7 +49,7 @@ class ParameterVector(eqx.Module):
         """Return the vector of the start."""
         return jnp.concatenate([_encoded(self.start, path) for path in self.paths])
 
-    def __call__(self, x: Float[Array, " p"]) -> RecipeParams:
+    def __call__(self, x: Float[Array, " p"]) -> Any:
         """Return the parameters of a vector."""
         params, used = self.start, 0
         for path in self.paths:
@@ -59,7 +59,7 @@ class ParameterVector(eqx.Module):
             used += size
         return params
 
-    def split(self, params: RecipeParams) -> tuple[RecipeParams, RecipeParams]:
+    def split(self, params: Any) -> tuple[Any, Any]:
         """Return the leaves that are tuned, and the others, each with None in place of the rest."""
         none = jax.tree.map(lambda _: False, self.start)
         tuned = eqx.tree_at(
@@ -80,7 +80,7 @@ class ParameterVector(eqx.Module):
 
 
 def free_parameters(
-    start: RecipeParams, patterns: tuple[str, ...] | list[str], rings: Callable[[], int] | None = None
+    start: eqx.Module, patterns: tuple[str, ...] | list[str], rings: Callable[[], int] | None = None
 ) -> ParameterVector:
     """Return the parameters that the patterns name.
 
@@ -88,7 +88,7 @@ def free_parameters(
     leaves alone.
 
     Args:
-        start: values to start from.
+        start: values to start from, a recipe's or :class:`lio_jax.settings.shared.GlobalParams`.
         patterns: paths with or without the leading ``params.``, or globs such as ``imu.*_noise``: of those,
             the leaves that have a derivative.
         rings: returns the number of the recording's rings; None: it is not known.
@@ -134,32 +134,32 @@ def _choice(paths: list[str]) -> str:
     return "those that can be tuned: " + ", ".join(paths) + "."
 
 
-def _may_start(start: RecipeParams, path: str) -> bool:
+def _may_start(start: eqx.Module, path: str) -> bool:
     value = _leaf(start, path)
     return value.size > 0 and (_tuned(start, path) != "log" or bool(value > 0))
 
 
-def _has_no_rings(start: RecipeParams, path: str) -> bool:
+def _has_no_rings(start: eqx.Module, path: str) -> bool:
     return settings_of(type(start))[path].declared.per_ring and not _leaf(start, path).size
 
 
-def _with_zeros(start: RecipeParams, paths: list[str], count: int) -> RecipeParams:
-    def leaves(params: RecipeParams) -> list[Array]:
+def _with_zeros(start: eqx.Module, paths: list[str], count: int) -> Any:
+    def leaves(params: Any) -> list[Array]:
         return [_leaf(params, path) for path in paths]
 
     return eqx.tree_at(leaves, start, [jnp.zeros(count, value.dtype) for value in leaves(start)])
 
 
-def _tuned(start: RecipeParams, path: str) -> Tuned | None:
+def _tuned(start: eqx.Module, path: str) -> Tuned | None:
     return settings_of(type(start))[path].declared.tuned
 
 
-def _leaf(params: RecipeParams, path: str) -> Array:
+def _leaf(params: Any, path: str) -> Array:
     section, name = path.split(".")
     return getattr(getattr(params, section), name)
 
 
-def _component_names(start: RecipeParams, path: str) -> tuple[str, ...]:
+def _component_names(start: eqx.Module, path: str) -> tuple[str, ...]:
     if settings_of(type(start))[path].declared.per_ring:
         return tuple(f"{path}.{ring}" for ring in range(len(_leaf(start, path))))
     if _leaf(start, path).ndim:
@@ -167,14 +167,14 @@ def _component_names(start: RecipeParams, path: str) -> tuple[str, ...]:
     return (path,)
 
 
-def _encoded(start: RecipeParams, path: str) -> Float[Array, " k"]:
+def _encoded(start: eqx.Module, path: str) -> Float[Array, " k"]:
     value, tuned = _leaf(start, path), _tuned(start, path)
     if tuned == "turn":
         return jnp.zeros(3, value.dtype)
     return jnp.atleast_1d(jnp.log(value) if tuned == "log" else value)
 
 
-def _decoded(start: RecipeParams, path: str, x: Float[Array, " k"]) -> Array:
+def _decoded(start: eqx.Module, path: str, x: Float[Array, " k"]) -> Array:
     value, tuned = _leaf(start, path), _tuned(start, path)
     if tuned == "turn":
         turned = jaxlie.SO3.from_quaternion_xyzw(value) @ jaxlie.SO3.exp(x)

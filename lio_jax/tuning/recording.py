@@ -42,7 +42,7 @@ class Recording:
             UsageError: the recording ends before ``start``.
         """
         check_start(sequence, start)
-        self.name = sequence.info.name
+        self.name, self.sequence = sequence.info.name, sequence
         samples, self.notes = imu_feed(sequence, settings)
         self._truth = truth if truth is not None else sequence.truth()
         self._read = lambda: scan_inputs(settings, sequence.scans(start, count), samples)

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import atomic_path
-from lio_jax.tuning.gradient import Evaluated, Loss
+from lio_jax.tuning.corrected import CorrectedLoss
+from lio_jax.tuning.evaluated import Evaluated
+from lio_jax.tuning.gradient import Loss
 from lio_jax.tuning.optimise import Bounds, adam, fisher_information, fisher_scoring, lbfgsb, stationary
 from lio_jax.tuning.parameters import ParameterVector
 from lio_jax.tuning.recording import Recording
@@ -56,7 +58,7 @@ class Session:
         self,
         folder: Path,
         free: ParameterVector,
-        loss: Loss,
+        loss: Loss | CorrectedLoss,
         training: Listing[Recording],
         validation: Listing[Recording],
         likelihood: bool,

@@ -77,7 +77,7 @@ def test_gates_leave_a_fix_every_few_metres_and_none_of_the_wrong_ones(town):
 def test_the_heading_is_found_on_the_first_stretch(town):
     _, odometry, fixes, used, _ = town
     p = antennas(odometry[used])
-    f, C = (np.array(each) for each in zip(*fixes, strict=True))
+    f, C, _ = (np.array(each) for each in zip(*fixes, strict=True))
     found = next(each for k in range(len(used)) if (each := alignment(p[:k], f[:k], C[:k], 0.1)) is not None)
     assert len(found.inlier) < 60
     yaw = np.arctan2(found.T_enu_odom[1, 0], found.T_enu_odom[0, 0])
@@ -96,7 +96,7 @@ def ate(positions, truth):
 @needs_shared
 def test_the_graph_takes_the_drift_out(town):
     truth, odometry, fixes, used, _ = town
-    f, C = (np.array(each) for each in zip(*fixes, strict=True))
+    f, C, _ = (np.array(each) for each in zip(*fixes, strict=True))
     found = alignment(antennas(odometry[used]), f, C, 0.1)
     T_enu = found.T_enu_odom @ odometry
     count = len(odometry)
@@ -140,6 +140,6 @@ def test_a_real_receiver_agrees_with_its_own_truth():
     found = [gate.used_fix(int(stamp), T, T) for stamp, T in zip(truth.stamp_ns, truth.poses, strict=True)]
     used = [number for number, each in enumerate(found) if isinstance(each, Fix)]
     assert len(used) > 5
-    f, C = (np.array(each) for each in zip(*(found[number] for number in used), strict=True))
+    f, C, _ = (np.array(each) for each in zip(*(found[number] for number in used), strict=True))
     aligned = alignment(truth.poses[used, :3, 3], f, C, 0.1)
     np.testing.assert_allclose(aligned.T_enu_odom, np.eye(4), atol=0.02)
