@@ -74,6 +74,12 @@ def _bag(name: str, seed: str, file: str, layout: str) -> Kind:
     )
 
 
+def _clouds(folder: str, files: str, draws: tuple[Draw, ...]) -> Kind:
+    command = ("export", f"{{in}}/{folder}", "--to", "native", "--out", "{out}/r")
+    name = f"clouds {folder} {files.partition('.')[2]}"
+    return Kind(name, "clouds", (f"{folder}/{files}",), draws, (command,), may_be_nan=_COPIED)
+
+
 _NOWHERE = r"nowhere: no such file or folder"
 
 KINDS = (
@@ -133,6 +139,15 @@ KINDS = (
         (("export", "{in}/day/drive", "--to", "native", "--out", "{out}/r"),),
         may_be_nan=_COPIED,
     ),
+    _clouds("binary", "*.pcd", (mutations.raw, mutations.raw, mutations.whole)),
+    _clouds("compressed", "*.pcd", (mutations.raw, mutations.raw, mutations.whole)),
+    _clouds("text", "*.pcd", _TEXT),
+    _clouds("text", "*.txt", _TEXT),
+    _clouds("text", "*.csv", _TEXT),
+    _clouds("text", "*.tum", _TEXT),
+    _clouds("ply", "*.ply", (mutations.raw, mutations.raw, mutations.whole)),
+    _clouds("npy", "*.npy", (mutations.raw, mutations.raw, mutations.whole)),
+    _clouds("bin", "*.bin", (mutations.raw, mutations.whole)),
     Kind(
         "tum",
         "poses",

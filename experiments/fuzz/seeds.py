@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from pypcd4 import Encoding, PointCloud
 from scipy.spatial.transform import Rotation
 
 from lio_jax.data import write_native
@@ -135,6 +136,7 @@ def write_seeds(root: Path, run: Run, with_run: bool) -> None:
         must("export", native, "--to", "bag", "--layout", layout, "--out", out)
     must("export", native, "--to", "kitti", "--out", root / "kitti" / "04")
     _write_kitti_raw(root / "kitti_raw" / "day")
+    _write_clouds(root / "clouds")
     _write_texts(root)
     (root / "native" / "my.yaml").write_text(SETTINGS)
     (root / "rest").mkdir()
@@ -213,6 +215,38 @@ def _write_kitti_raw(day: Path) -> None:
     (day / "calib_imu_to_velo.txt").write_text(
         "calib_time: 25-May-2012 16:47:16\nR: 1 0 0 0 1 0 0 0 1\nT: -0.8 0.3 -0.8\n"
     )
+
+
+def _write_clouds(root: Path) -> None:
+    """Write the scans as a folder of clouds in each format; text files lie beside those of ``text``."""
+    for name in ("binary", "compressed", "text", "ply", "npy", "bin"):
+        (root / name).mkdir(parents=True)
+    scans = [_scan(number) for number in range(_SCANS)]
+    for scan in scans:
+        columns = [*scan.points.T, scan.intensity, scan.time, scan.ring.astype(np.float32)]
+        rows = np.stack(columns, axis=1).astype(np.float32)
+        names = ("x", "y", "z", "intensity", "time", "ring")
+        cloud = PointCloud.from_points(rows, names, (np.float32,) * 6)
+        for name, encoding in (
+            ("binary", Encoding.BINARY),
+            ("compressed", Encoding.BINARY_COMPRESSED),
+            ("text", Encoding.ASCII),
+        ):
+            cloud.save(root / name / f"{scan.stamp_ns}.pcd", encoding)
+        header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+        header += [*(f"property float {name}" for name in names), "end_header\n"]
+        ply = "\n".join(header).encode() + rows.tobytes()
+        (root / "ply" / f"{scan.stamp_ns}.ply").write_bytes(ply)
+        np.save(root / "npy" / f"{scan.stamp_ns}.npy", rows[:, :4])
+        rows[:, :4].tofile(root / "bin" / f"{scan.stamp_ns}.bin")
+    seconds = "".join(f"{scan.stamp_ns / 1e9:.6f}\n" for scan in scans)
+    (root / "text" / "times.txt").write_text(seconds)
+    imu = _imu(80)
+    lines = ["t,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"]
+    for stamp_ns, gyro, accel in zip(imu.stamp_ns, imu.gyro, imu.accel, strict=True):
+        lines.append(",".join(map(str, (stamp_ns, *gyro, *accel))))
+    (root / "text" / "imu.csv").write_text("\n".join(lines) + "\n")
+    write_tum(root / "text" / "truth.tum", _truth())
 
 
 def _write_texts(root: Path) -> None:

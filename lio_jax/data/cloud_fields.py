@@ -51,7 +51,10 @@ def assemble(
     time_field: str,
     keep: NDArray[np.bool_] | None = None,
 ) -> RawCloud:
-    """Drop points without a return (NaN, infinite, all zero, ``keep`` false, no finite time); pack the rest.
+    """Drop points without a return, and pack the rest.
+
+    A point counts as without a return if a coordinate is NaN or infinite, if all are zero, if its time or its
+    ring is no number, or where ``keep`` is false.
 
     Args:
         xyz: (3, n) m, one row for each coordinate.
@@ -62,6 +65,8 @@ def assemble(
         valid &= keep
     if time is not None and time.dtype.kind == "f":
         valid &= np.isfinite(time)
+    if ring is not None and ring.dtype.kind == "f":
+        valid &= np.abs(ring) <= _HIGHEST_RING
     if valid.all():
         chosen: Any = slice(None)
     else:
@@ -116,6 +121,8 @@ _TIME = (
 _RING = ("ring", "line", "channel", "laser_id", "laserid", "laser", "beam", "ring_id")
 _INTENSITY = ("intensity", "intensities", "reflectivity", "signal", "reflectance", "i")
 _MOST_ROWS = 256
+_HIGHEST_RING = 2**31 - 256
+"""Largest ring that a float32 states and an int32 holds."""
 
 
 @dataclass(frozen=True)

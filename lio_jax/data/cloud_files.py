@@ -105,12 +105,14 @@ def _ply(path: Path, warn: Warn) -> NDArray[Any]:
     """
     with path.open("rb") as file:
         order, count, dtype = _header(file)
+        # a damaged header may state any number
+        most = min(count, path.stat().st_size)
         points: NDArray[Any]
         if order:
-            points = np.frombuffer(file.read(count * dtype.itemsize), np.uint8)
+            points = np.frombuffer(file.read(most * dtype.itemsize), np.uint8)
             points = points[: len(points) // dtype.itemsize * dtype.itemsize].view(dtype)
         else:
-            points = _text_points(file, count, dtype)
+            points = _text_points(file, most, dtype)
     if len(points) < count:
         warn(f"{path}: truncated ({len(points)} of {count} points): its whole points are used.")
     return points

@@ -23,6 +23,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lio_jax.core.timestamps import FARTHEST_NS
 from lio_jax.data.config import DataConfig
 
 TICK_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
@@ -68,10 +69,18 @@ class PointTiming:
             time: (n,) ticks of the real returns.
         """
         longest = 2.0 * self.sweep * 1e9 / self.tick_ns
-        if time.size == 0 or time.max().item() - time.min().item() <= longest:
+        if time.size == 0 or self.can_be_scan(time.min().item(), time.max().item()):
             return None
-        wrong: NDArray[np.bool_] = np.abs(time.astype(np.float64) - float(np.median(time))) > 0.75 * longest
+        middle = float(np.median(time.astype(np.float64)))
+        if not abs(middle) * self.tick_ns < FARTHEST_NS:
+            return np.ones(time.shape, bool)
+        wrong: NDArray[np.bool_] = np.abs(time.astype(np.float64) - middle) > 0.75 * longest
         return wrong
+
+    def can_be_scan(self, low: float | int, high: float | int) -> bool:
+        """Return whether ticks from ``low`` to ``high`` are those of one scan, at a time that ns can hold."""
+        longest = 2.0 * self.sweep * 1e9 / self.tick_ns
+        return high - low <= longest and max(abs(low), abs(high)) * self.tick_ns < FARTHEST_NS
 
     def place(
         self, header_ns: int, time: NDArray[Any], low: float | int, high: float | int

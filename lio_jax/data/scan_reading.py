@@ -59,14 +59,15 @@ class ScanReading:
             return start_ns, azimuth_time(cloud.points, self.sweep), self.sweep, None
         low, high = cloud.time_range
         time, keep = cloud.time, None
-        if (high - low) * self.timing.tick_ns * 1e-9 > 2.0 * self.sweep:
+        if not self.timing.can_be_scan(low, high):
             outliers = self.timing.outliers(time)
             if outliers is not None:
                 keep = ~outliers
                 time = time[keep]
                 warn(f"{name}: {np.count_nonzero(outliers)} points with impossible times were dropped.")
-            if time.size:
-                low, high = time.min().item(), time.max().item()
+            if not time.size:
+                return cloud.stamp_ns, time.astype(np.float32), self.sweep, keep
+            low, high = time.min().item(), time.max().item()
         return *self.timing.place(cloud.stamp_ns, time, low, high), keep
 
 

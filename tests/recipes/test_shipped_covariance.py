@@ -71,11 +71,13 @@ def test_the_strips_that_few_beams_sweep_over_a_surface_leave_the_pose_as_good_a
     assert 0.25 < velocity < 4
 
 
+@pytest.mark.long
 def test_strips_taken_for_planes_confirm_a_drift_that_the_covariance_does_not_know():
     pose, _ = normalised(sixteen_beams(), "default", ["params.registration.least_width=0"])
     assert pose > 4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("recipe", "overrides"), [("default", LIDAR_ONLY), ("fast_lio2", [])])
 def test_errors_in_a_street_are_as_large_as_the_covariance_says(recipe, overrides):
     pose, velocity = normalised(streets(), recipe, overrides)
@@ -83,12 +85,14 @@ def test_errors_in_a_street_are_as_large_as_the_covariance_says(recipe, override
     assert 0.25 < velocity < 4
 
 
+@pytest.mark.long
 def test_a_map_that_is_taken_for_exact_leaves_the_pose_far_too_sure():
     as_fast_lio2 = ["config.fast_lio2.exact_map=true", "params.knn.least_width=0"]
     pose, _ = normalised(streets()[:1], "fast_lio2", as_fast_lio2)
     assert pose > 4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("recipe", "overrides"), [("default", LIDAR_ONLY), ("loam", [])])
 def test_without_inertial_samples_pose_and_velocity_have_a_covariance(recipe, overrides):
     results = tracked(streets()[0], recipe, overrides)[1]

@@ -1,0 +1,53 @@
+"""Clouds with numbers that no sensor gives: what remains is used, and a sentence names the rest."""
+
+import numpy as np
+import pytest
+
+from tests.data import bags
+from tests.data.cloud_files import packed, pcd_bytes, ply_bytes
+from tests.data.test_clouds import CLOUD, POINTS, SEEN, folder, opened
+
+NAMES = [f"{bags.START_NS + number * bags.PERIOD_NS}.pcd" for number in range(4)]
+
+
+def with_field(name: str, values: np.ndarray) -> np.ndarray:
+    """Return the cloud with one field as float32 numbers."""
+    plain = packed(CLOUD)
+    fields = [(one, np.dtype("<f4") if one == name else plain.dtype[one]) for one in plain.dtype.names or ()]
+    changed = np.zeros(plain.shape, fields)
+    for one, _ in fields:
+        changed[one] = plain[one]
+    changed[name] = values
+    return changed
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -3e20])
+def test_points_whose_ring_is_no_number_are_dropped(tmp_path, wrong):
+    rings = SEEN.ring.astype(np.float32)
+    rings[:7] = wrong
+    scans = list(opened(folder(tmp_path, NAMES, pcd_bytes(with_field("ring", rings)))).scans())
+    assert [(len(scan.points), scan.dropped) for scan in scans] == [(POINTS - 7, 7)] * 4
+    np.testing.assert_array_equal(scans[0].ring, SEEN.ring[7:])
+
+
+@pytest.mark.parametrize("wrong", [1e25, -3e38])
+def test_a_scan_whose_times_are_impossible_has_no_points(tmp_path, wrong):
+    path = folder(tmp_path, NAMES, pcd_bytes(with_field("time", SEEN.time)))
+    (path / NAMES[2]).write_bytes(pcd_bytes(with_field("time", np.full(POINTS, wrong))))
+    sequence = opened(path)
+    scans = list(sequence.scans())
+    assert [len(scan.points) for scan in scans] == [POINTS, POINTS, 0, POINTS]
+    assert [scan.stamp_ns for scan in scans] == [int(name[:-4]) for name in NAMES]
+    assert f"{POINTS} points with impossible times were dropped" in " ".join(sequence.warnings_so_far)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_a_number_of_points_beyond_the_file_is_a_truncation(tmp_path, form):
+    content = ply_bytes(CLOUD, form)
+    stated = b"9" * 25
+    damaged = content.replace(b"vertex %d" % POINTS, b"vertex " + stated)
+    path = folder(tmp_path, [name.replace("pcd", "ply") for name in NAMES], content)
+    (path / NAMES[1].replace("pcd", "ply")).write_bytes(damaged)
+    sequence = opened(path)
+    assert [len(scan.points) for scan in sequence.scans()] == [POINTS] * 4
+    assert f"of {stated.decode()} points" in sequence.warnings_so_far[0]
