@@ -30,7 +30,7 @@ WRONG = {
     "inspect a --jsn": "inspect: unknown option '--jsn'; did you mean --json?",
     "run": "run: needs DATA and --out DIR; --help explains the command.",
     "run a": "run: needs --out DIR; --help explains the command.",
-    "eval a": "eval: needs REFERENCE; --help explains the command.",
+    "eval a": "eval: needs either REFERENCE or --gps DATA; --help explains the command.",
     "run a --out": "run: a value is missing behind --out; write --out DIR.",
     "run a b --out c": "run: 'b' is more than the command takes; --help explains it.",
     "demo --overwrite yes": "demo: 'yes' is more than the command takes; --help explains it.",
