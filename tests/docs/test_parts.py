@@ -50,6 +50,7 @@ def test_the_map_knows_the_slope(ran):
     np.testing.assert_allclose(upwards, np.tile([-0.1, 0.0, 1.0] / np.sqrt(1.01), (100, 1)), atol=1e-3)
 
 
+@pytest.mark.long
 def test_smoothing_lowers_the_error_as_its_covariance_says(ran):
     found = ran("smoother")
     result, place = found["result"], found["place"]

@@ -67,6 +67,7 @@ def evalio(data: Path, *words: str) -> subprocess.CompletedProcess:
     )
 
 
+@pytest.mark.long
 def test_a_run_of_evalio_is_complete_and_near_the_truth(data, street):
     out = data / "results"
     done = evalio(data, "run", "-d", NAME, "-p", "lio_jax_default", "-p", "kiss", "-o", str(out))
@@ -83,6 +84,7 @@ def test_a_run_of_evalio_is_complete_and_near_the_truth(data, street):
     assert errors["kiss"] < 1.0
 
 
+@pytest.mark.long
 def test_a_pipeline_gives_the_poses_of_a_run_to_the_bit(street):
     pipe = LioJaxDefault()
     pipe.set_params(pipe.default_params())

@@ -126,6 +126,7 @@ def test_a_way_along_which_nothing_shows_the_motion_is_doubtful_without_inertial
         assert found["since_s"] == pytest.approx(since, abs=1e-3)
 
 
+@pytest.mark.long
 def test_what_stays_behind_in_a_tunnel_is_noticed():
     sequence = SimulatedSequence("tunnel", duration_s=15.0, seed=1)
     settings, results = tracked(sequence, "loam")
@@ -159,6 +160,7 @@ def test_a_direction_that_only_inertial_samples_show_is_doubtful_after_five_seco
     assert (found["state"] != "sound") == is_doubted
 
 
+@pytest.mark.long
 def test_a_drone_over_a_field_warns_before_it_is_a_metre_off():
     sequence = SimulatedSequence("field", duration_s=11.0, seed=1, imu=ImuModel())
     settings, results = tracked(sequence, "lio_sam")
@@ -197,7 +199,10 @@ def test_plan_views_are_compared_at_any_speed():
     assert all(one.error < 0.5 and one.way > 3 for one in late)
 
 
-@pytest.mark.parametrize("recipe", ["default", "fast_lio2", "lio_sam", "loam"])
+LONG = [pytest.param(name, marks=pytest.mark.long) for name in ("lio_sam", "loam")]
+
+
+@pytest.mark.parametrize("recipe", ["default", "fast_lio2", *LONG])
 def test_a_right_start_is_sound(recipe):
     found = verdict_of(*tracked(road("street", 25.0, 0.0, 8), recipe))
     assert found == {"state": "sound", "since_s": None, "reasons": []}

@@ -117,6 +117,7 @@ def run(fixes: bool, elevation: bool = True):
     return settings, found, CorrectedRun(seen, truth, replayed, 5, 0), expected
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "fixes", [pytest.param(False, marks=pytest.mark.long), True], ids=["loops", "loops and fixes"]
 )
