@@ -8,6 +8,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from lio_jax.data.sequence import check_still_there
 from lio_jax.data.velodyne_file import read_returns
 
 _ROW = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4")])
@@ -25,11 +26,15 @@ def read_cloud(path: Path, warn: Warn) -> NDArray[Any] | None:
     Args:
         path: path of the file; its suffix is in ``CLOUD_SUFFIXES``.
         warn: function that takes each sentence.
+
+    Raises:
+        LioJaxError: the whole folder is gone.
     """
     try:
         return _READERS[path.suffix.lower()](path, warn)
     # pypcd4 and the parsers of numpy raise exceptions of many kinds on damaged bytes
     except Exception as error:
+        check_still_there(path)
         reason = " ".join(str(error).split()) or type(error).__name__
         warn(f"{path}: cannot be read ({reason}), it may be truncated: the scan was skipped.")
         return None

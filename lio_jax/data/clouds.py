@@ -4,8 +4,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data.cloud_fields import RawCloud, choose_fields, cloud_of
@@ -113,11 +115,11 @@ class CloudFolder:
 
         def looked_at() -> Iterator[tuple[RawCloud, int]]:
             for stamp_ns, file in zip(self._stamps.stamp_ns, self._stamps.files, strict=True):
-                cloud = self._cloud(stamp_ns, file)
-                if cloud is not None:
-                    firsts.append(cloud)
+                points = read_cloud(file, self._log.add)
+                if points is not None:
+                    firsts.append(self._cloud(stamp_ns, file, points))
                     # a folder knows no time of receipt
-                    yield cloud, stamp_ns
+                    yield firsts[-1], stamp_ns
 
         stamped = not self._stamps.counted
         reading = recognise_clouds(looked_at(), self._config, str(self._path), stamped)
@@ -145,10 +147,7 @@ class CloudFolder:
         )
         return 1.0
 
-    def _cloud(self, stamp_ns: int, file: Path) -> RawCloud | None:
-        points = read_cloud(file, self._log.add)
-        if points is None:
-            return None
+    def _cloud(self, stamp_ns: int, file: Path, points: NDArray[Any]) -> RawCloud:
         remedy = "name its fields x, y and z"
         fields = choose_fields(points.dtype.names or (), self._config.time_field, str(file), remedy)
         return cloud_of(stamp_ns, points, fields)
@@ -157,12 +156,13 @@ class CloudFolder:
         stop = None if count is None else start + count
         chosen = slice(start, stop)
         for stamp_ns, file in zip(self._stamps.stamp_ns[chosen], self._stamps.files[chosen], strict=True):
+            points = read_cloud(file, self._log.add)
+            if points is None:
+                continue
             try:
-                cloud = self._cloud(stamp_ns, file)
+                cloud = self._cloud(stamp_ns, file, points)
             except LioJaxError as error:
                 self._log.add(f"{error} The scan was skipped.")
-                continue
-            if cloud is None:
                 continue
             if self._scale != 1.0:
                 cloud = replace(cloud, points=cloud.points * np.float32(self._scale))

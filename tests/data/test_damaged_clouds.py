@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from lio_jax.core.errors import LioJaxError
 from tests.data import bags
 from tests.data.cloud_files import packed, pcd_bytes, ply_bytes
-from tests.data.test_clouds import CLOUD, POINTS, SEEN, folder, opened
+from tests.data.test_clouds import BARE, CLOUD, POINTS, SEEN, folder, npy_bytes, opened
 
 NAMES = [f"{bags.START_NS + number * bags.PERIOD_NS}.pcd" for number in range(4)]
 
@@ -51,3 +52,20 @@ def test_a_number_of_points_beyond_the_file_is_a_truncation(tmp_path, form):
     sequence = opened(path)
     assert [len(scan.points) for scan in sequence.scans()] == [POINTS] * 4
     assert f"of {stated.decode()} points" in sequence.warnings_so_far[0]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "content"),
+    [
+        (".pcd", pcd_bytes(CLOUD)),
+        (".ply", ply_bytes(CLOUD)),
+        (".npy", npy_bytes(packed(CLOUD))),
+        (".bin", BARE.tobytes()),
+    ],
+)
+def test_a_folder_that_is_lost_ends_the_scans(tmp_path, suffix, content):
+    path = folder(tmp_path / "walk", [name.replace(".pcd", suffix) for name in NAMES], content)
+    sequence = opened(path)
+    path.rename(tmp_path / "elsewhere")
+    with pytest.raises(LioJaxError, match=r"walk: is gone while it was read \(No such file or directory\)"):
+        list(sequence.scans())
