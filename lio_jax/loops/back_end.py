@@ -58,11 +58,7 @@ def corrected_poses(
         keyframes_T_odom_imu: (k, 4, 4) poses of the keyframes by the odometry, m.
         keyframes_T_world_imu: (k, 4, 4) corrected poses of the keyframes, m.
     """
-    last = len(keyframe_stamp_ns) - 1
-    before = np.clip(np.searchsorted(keyframe_stamp_ns, stamp_ns, side="right") - 1, 0, last)
-    after = np.minimum(before + 1, last)
-    span = (keyframe_stamp_ns[after] - keyframe_stamp_ns[before]).astype(np.float64)
-    share = np.clip((stamp_ns - keyframe_stamp_ns[before]) / np.where(span > 0, span, 1.0), 0.0, 1.0)
+    before, after, share = between_keyframes(stamp_ns, keyframe_stamp_ns)
     T_world_odom = keyframes_T_world_imu @ np.linalg.inv(keyframes_T_odom_imu)
     seen_before, seen_after = T_world_odom[before] @ T_odom_imu, T_world_odom[after] @ T_odom_imu
     turn = Rotation.from_matrix(seen_before[:, :3, :3].transpose(0, 2, 1) @ seen_after[:, :3, :3])
@@ -71,6 +67,25 @@ def corrected_poses(
     poses[:, :3, :3] = seen_before[:, :3, :3] @ part_of_turn
     poses[:, :3, 3] += share[:, None] * (seen_after[:, :3, 3] - seen_before[:, :3, 3])
     return poses
+
+
+def between_keyframes(
+    stamp_ns: NDArray[np.int64], keyframe_stamp_ns: NDArray[np.int64]
+) -> tuple[NDArray[np.intp], NDArray[np.intp], _Array]:
+    """Return the keyframes before and after each pose, and its share of the time between them, (n,) each.
+
+    Both are the first keyframe before it, or the last one after it. The share is from 0 to 1.
+
+    Args:
+        stamp_ns: (n,) times of the poses, ns.
+        keyframe_stamp_ns: (k,) times of the keyframes, ns, ascending, at least one.
+    """
+    last = len(keyframe_stamp_ns) - 1
+    before = np.clip(np.searchsorted(keyframe_stamp_ns, stamp_ns, side="right") - 1, 0, last)
+    after = np.minimum(before + 1, last)
+    span = (keyframe_stamp_ns[after] - keyframe_stamp_ns[before]).astype(np.float64)
+    share = np.clip((stamp_ns - keyframe_stamp_ns[before]) / np.where(span > 0, span, 1.0), 0.0, 1.0)
+    return before, after, share
 
 
 def levelled_onto(T_a_imu: _Array, T_b_imu: _Array) -> _Array:

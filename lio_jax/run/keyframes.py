@@ -51,13 +51,11 @@ class KeyframePicker:
         known.
         """
         T, outage = tracked.T_world_imu, tracked.outage
-        covariance = _pose_covariance(tracked)
-        known = covariance is not None and only_leaves_open(tracked.output)
-        self._failed |= bool(tracked.failure) and not known
+        self._failed |= bool(tracked.failure) and not _is_stated(tracked)
         moved = self._last is None or is_keyframe(self._last.T_odom_imu, T, self._distance, self._angle)
         if not np.isfinite(T).all() or not (moved or outage):
             return None
-        points = points_in_imu(tracked)
+        points, covariance = points_in_imu(tracked), _pose_covariance(tracked)
         stated = None if outage or self._failed else self._stated_since_last(T, covariance)
         unknown = _across(outage) if outage else _LOOSE
         self._last = Keyframe(
@@ -84,6 +82,11 @@ class KeyframePicker:
             return np.zeros((6, 6))
         T_this_last = np.linalg.inv(T_odom_imu) @ self._last.T_odom_imu
         return stated_growth(before, covariance, T_this_last)
+
+
+def _is_stated(tracked: ScanResult) -> bool:
+    """Return whether the covariance of a scan that failed contains the error of its pose."""
+    return only_leaves_open(tracked.output) and _pose_covariance(tracked) is not None
 
 
 def _pose_covariance(tracked: ScanResult) -> NDArray[np.float64] | None:

@@ -5,7 +5,6 @@ The choices of the back end are those of one run at the first parameters (see
 """
 
 from collections.abc import Sequence as Listing
-from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -30,7 +29,7 @@ from lio_jax.settings.settings import Settings
 from lio_jax.settings.shared import GlobalParams
 from lio_jax.tuning.evaluated import Evaluated
 from lio_jax.tuning.objectives import Named, Objective, Observed, TruePose
-from lio_jax.tuning.parameters import ParameterVector, free_parameters
+from lio_jax.tuning.parameters import ParameterVector, free_parameters, named_leaves
 from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.replayed_graph import ReplayedGraph, replayed_graph
 from lio_jax.tuning.streaming import split_objective
@@ -46,8 +45,8 @@ def names_back_end(patterns: Listing[str], settings: Settings) -> bool:
     Raises:
         UsageError: they name both, or the run has no back end.
     """
-    own = settings_of(recipe_named(settings.recipe).params_type)
-    back_end = [pattern for pattern in patterns if _matches(pattern, GlobalParams) and not _any(pattern, own)]
+    own, shared = settings_of(recipe_named(settings.recipe).params_type), settings_of(GlobalParams)
+    back_end = [one for one in patterns if named_leaves(one, shared) and not named_leaves(one, own)]
     if not back_end:
         return False
     if rest := [pattern for pattern in patterns if pattern not in back_end]:
@@ -62,14 +61,6 @@ def names_back_end(patterns: Listing[str], settings: Settings) -> bool:
             "config.backend.gps=true."
         )
     return True
-
-
-def _matches(pattern: str, tree: Any) -> bool:
-    return _any(pattern, settings_of(tree))
-
-
-def _any(pattern: str, paths: Any) -> bool:
-    return any(fnmatchcase(path, pattern.removeprefix("params.")) for path in paths)
 
 
 def free_of_back_end(settings: Settings, patterns: Listing[str], named: Named) -> ParameterVector:
@@ -161,19 +152,12 @@ class CorrectedLoss:
 
     def __call__(self, x: NDArray[np.float64], recordings: Listing[Recording]) -> Evaluated:
         """Return the loss at a vector of parameters, with its gradient."""
-        counts = np.array([len(recording) for recording in recordings])
         results = [
             corrected_gradient(self.run_over(one), self._free, self._objective, jnp.asarray(x))
             for one in recordings
         ]
-        shares = counts / counts.sum()
-        return Evaluated(
-            value=float(shares @ [value for value, _ in results]),
-            gradient=shares @ np.stack([gradient for _, gradient in results]),
-            scores=None,
-            unconverged=0,
-            scans=int(counts.sum()),
-        )
+        values, gradients = zip(*results, strict=True)
+        return Evaluated.mean([len(recording) for recording in recordings], values, gradients)
 
     def values(self, xs: NDArray[np.float64], recording: Recording) -> NDArray[np.float64]:
         """Return the objective of one recording at each row of ``xs``."""

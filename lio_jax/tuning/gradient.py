@@ -144,21 +144,20 @@ class Loss:
         results: list[Gradient] | list[TotalGradient]
         if self._forward:
             results = [streaming_gradient(*about, one, self._through_map) for one in recordings]
-            counts = np.array([len(result.scores) for result in results])
+            counts = [len(result.scores) for result in results]
             weighted = [count * result.scores for count, result in zip(counts, results, strict=True)]
             scores = np.concatenate(weighted)
         else:
             results = [
                 checkpointed_gradient(*about, one, through_map=self._through_map) for one in recordings
             ]
-            counts, scores = np.array([len(one) for one in recordings]), None
-        shares = counts / counts.sum()
-        return Evaluated(
-            value=float(shares @ [result.value for result in results]),
-            gradient=shares @ np.stack([result.gradient for result in results]),
-            scores=scores,
-            unconverged=sum(len(result.unconverged) for result in results),
-            scans=int(counts.sum()),
+            counts, scores = [len(one) for one in recordings], None
+        return Evaluated.mean(
+            counts,
+            [result.value for result in results],
+            [result.gradient for result in results],
+            scores,
+            sum(len(result.unconverged) for result in results),
         )
 
     def values(self, xs: NDArray[np.float64], recording: Recording) -> NDArray[np.float64]:

@@ -1,6 +1,6 @@
 """The parameters that are tuned, as one vector: positive ones by their logarithm."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from fnmatch import fnmatchcase
 from functools import partial
 from typing import Any
@@ -101,8 +101,7 @@ def free_parameters(
     smooth_ones = [path for path, leaf in leaves.items() if leaf.declared.tuned]
     chosen: list[str] = []
     for pattern in patterns:
-        bare = pattern.removeprefix("params.")
-        named = [leaf for leaf in leaves if fnmatchcase(leaf, bare)]
+        named = named_leaves(pattern, leaves)
         if not named:
             raise UsageError(f"no parameter is called '{pattern}'; {_choice(smooth_ones)}")
         smooth = [leaf for leaf in named if leaf in smooth_ones]
@@ -128,6 +127,12 @@ def free_parameters(
     if not chosen:
         raise UsageError(f"no parameter to tune was named; {_choice(smooth_ones)}")
     return ParameterVector(start, tuple(chosen))
+
+
+def named_leaves(pattern: str, paths: Iterable[str]) -> list[str]:
+    """Return the paths that a path or a glob names, with or without the leading ``params.``."""
+    bare = pattern.removeprefix("params.")
+    return [path for path in paths if fnmatchcase(path, bare)]
 
 
 def _choice(paths: list[str]) -> str:

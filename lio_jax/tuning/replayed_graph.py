@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
-from lio_jax.loops.back_end import Correction, graph_of
+from lio_jax.loops.back_end import Correction, between_keyframes, graph_of
 from lio_jax.loops.edge_noise import fix_covariance, loop_covariance, odometry_covariance
 from lio_jax.pose_graph.graph import LOOP, ODOMETRY, POSITION, PoseGraph, Poses, picked, poses_from
 from lio_jax.pose_graph.pose_derivative import solved_poses
@@ -72,11 +72,7 @@ def replayed_graph(
     used = [edge for edge, weight in zip(found.edges, found.weights, strict=True) if weight > _BELIEVED]
     aligned = found.T_enu_world is not None
     poses = found.T_world_imu if found.T_enu_world is None else found.T_enu_world @ found.T_world_imu
-    last = len(found.stamp_ns) - 1
-    before = np.clip(np.searchsorted(found.stamp_ns, stamp_ns, side="right") - 1, 0, last)
-    after = np.minimum(before + 1, last)
-    span = (found.stamp_ns[after] - found.stamp_ns[before]).astype(np.float64)
-    passed = (stamp_ns - found.stamp_ns[before]) / np.where(span > 0, span, 1.0)
+    before, after, share = between_keyframes(stamp_ns, found.stamp_ns)
     stated = [np.zeros((6, 6)) if edge.stated is None else edge.stated for edge in used]
     return ReplayedGraph(
         graph=graph_of(poses, used),
@@ -86,7 +82,7 @@ def replayed_graph(
         odometry=_se3(T_odom_imu),
         before=jnp.asarray(before),
         after=jnp.asarray(after),
-        share=jnp.asarray(np.clip(passed, 0.0, 1.0)),
+        share=jnp.asarray(share),
         aligned=aligned,
         elevation=elevation,
     )
