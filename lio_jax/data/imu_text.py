@@ -38,11 +38,8 @@ def read_imu_text(path: Path) -> tuple[ImuData, str]:
     if not lines:
         raise LioJaxError(f"{path}: holds no samples; give a table with the columns {_COLUMNS}.")
     width = len(lines[0][1])
-    for number, words in lines:
-        if len(words) != width or not all(map(_is_number, words)):
-            raise LioJaxError(f"{path}: line {number} does not hold {width} numbers; fix or remove it.")
+    table = np.array([_row(path, number, words, width) for number, words in lines])
     columns = None if names is None else _named(names)
-    table = np.array([[float(word) for word in words] for _, words in lines])
     if columns is not None and max(columns) < width:
         note = "columns by their names"
     elif width == 7:
@@ -62,6 +59,16 @@ def read_imu_text(path: Path) -> tuple[ImuData, str]:
 def _words(line: str) -> list[str]:
     line = line.strip().lstrip("#%").strip()
     return [word.strip() for word in (line.split(",") if "," in line else line.split())] or [""]
+
+
+def _row(path: Path, number: int, words: list[str], width: int) -> list[float]:
+    try:
+        row = [float(word) for word in words]
+    except ValueError:
+        row = []
+    if len(row) != width:
+        raise LioJaxError(f"{path}: line {number} does not hold {width} numbers; fix or remove it.")
+    return row
 
 
 def _is_number(word: str) -> bool:

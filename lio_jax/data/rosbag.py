@@ -195,23 +195,22 @@ class RosbagSequence:
 
     def _recognised(self, reader: "AnyReader") -> ScanReading:
         """Settle from the topic's first clouds with points how its clouds are read."""
-        reason = ""
+        undecoded: list[str] = []
         damage: list[str] = []
 
         def decoded() -> Iterator[tuple[RawCloud, int]]:
-            nonlocal reason
             messages = until_damage(self._messages(reader, self._lidar), damage.append)
             for _, received_ns, raw in messages:
                 try:
                     cloud = decode_cloud(reader, self._lidar, raw, self._config.time_field, self._where)
                 except ValueError as error:
-                    reason = f" ({error})"
+                    undecoded.append(str(error))
                     continue
                 yield cloud, received_ns
 
         reading = recognise_clouds(decoded(), self._config, self._where)
         if reading is None:
-            reason = reason or "".join(f" ({cause})" for cause in damage)
+            reason = "".join(f" ({cause})" for cause in [*damage, *undecoded][-1:])
             raise LioJaxError(
                 f"{self._where}: no point cloud can be read{reason}; the recording is empty or damaged there."
             )

@@ -26,7 +26,7 @@ from lio_jax.run.fitted_settings import with_given_noise, with_sensor_sizes
 from lio_jax.run.pushed import PushedOdometry, rehearse
 from lio_jax.run.scan_inputs import bucket_for
 from lio_jax.run.track import ScanResult, pose_matrix
-from lio_jax.settings.settings import Settings, declared_settings, recipe_settings
+from lio_jax.settings.settings import Settings, declared_settings, recipe_settings, uses_imu
 
 _OF_THE_CALIBRATION = "extrinsics"
 """Section that evalio itself gives."""
@@ -138,7 +138,7 @@ class RecipePipeline(Pipeline):  # type: ignore[misc, unused-ignore]
         for path, value in self._params.items():
             if value != defaults[path]:
                 settings = settings.with_value(path, value, "evalio")
-        if self.recipe_uses_imu:
+        if uses_imu(settings):
             settings = with_given_noise(settings, self._imu.gyro, self._imu.accel)
             gravity = float(np.linalg.norm(self._imu.gravity))
             if gravity > 0 and "params.imu.gravity" not in settings.given:
@@ -154,11 +154,6 @@ class RecipePipeline(Pipeline):  # type: ignore[misc, unused-ignore]
         size = bucket_for(len(scan.points), settings.config.lidar)
         settings = settings.with_value("config.lidar.buckets", [size], "evalio")
         return with_sensor_sizes(settings, [scan])[0]
-
-    @property
-    def recipe_uses_imu(self) -> bool:
-        """Return whether the recipe takes inertial samples."""
-        return recipe_named(self.recipe).needs.imu != "unused"
 
     def _save(self, results: list[ScanResult]) -> None:
         for result in results:

@@ -14,9 +14,8 @@ from lio_jax.imu.allan import noise_in_motion
 from lio_jax.lidar.params import RingConfig
 from lio_jax.lidar.range_scatter import scattered_range_noise
 from lio_jax.recipes import recipe_named
-from lio_jax.recipes.params import InertialConfig
 from lio_jax.run.scan_inputs import padded
-from lio_jax.settings.settings import Settings, declared_settings
+from lio_jax.settings.settings import Settings, declared_settings, uses_imu
 
 _NEAR_M, _SHARE = 10.0, 90
 """Surroundings are near if this percentage of the points is within this range, m.
@@ -75,10 +74,8 @@ def with_inertial_noise(sequence: Sequence, settings: Settings) -> tuple[Setting
     What was given stays. The recipe's own values are for a sensor of which nothing is known: they stay where
     the recording shows more noise, which is vibration, or where its samples are too few or too slow.
     """
-    config = settings.config
-    uses_imu = isinstance(config, InertialConfig) and config.imu.use
     free = [path for path in _NOISE if path not in settings.given]
-    if not recipe_named(settings.recipe).noise_from_recording or not uses_imu or not free:
+    if not recipe_named(settings.recipe).noise_from_recording or not uses_imu(settings) or not free:
         return settings, []
     recorded = sequence.imu()
     if recorded is None or not len(recorded.stamp_ns):
@@ -90,13 +87,18 @@ def with_inertial_noise(sequence: Sequence, settings: Settings) -> tuple[Setting
         _, section, name = path.split(".")
         found = noise_in_motion(seconds, imu.gyro if name == "gyro_noise" else imu.accel)
         own = settings.values[section][name]
-        if found is not None and _MARGIN * found < own:
-            value = float(f"{max(_MARGIN * found, _QUIETEST * own):.3g}")
+        if found is not None and _with_margin(found, own) < own:
+            value = float(f"{_with_margin(found, own):.3g}")
             settings = settings.with_value(path, value, "the recording's inertial samples")
             words.append(f"{path.removeprefix('params.')} {value:g} {_NOISE[path]}")
     if not words:
         return settings, []
     return settings, [f"noise of the inertial samples, with a margin of {_MARGIN:g}: {', '.join(words)}."]
+
+
+def _with_margin(noise: float, own: float) -> float:
+    """Return a noise with the margin, between a share of the recipe's own value and that value."""
+    return min(max(_MARGIN * noise, _QUIETEST * own), own)
 
 
 def with_given_noise(settings: Settings, gyro_noise: float, accel_noise: float) -> Settings:
@@ -116,8 +118,7 @@ def with_given_noise(settings: Settings, gyro_noise: float, accel_noise: float) 
         _, section, name = path.split(".")
         own = settings.values[section][name]
         if path not in settings.given:
-            value = min(max(_MARGIN * noise, _QUIETEST * own), own)
-            settings = settings.with_value(path, value, "the sensor's calibration")
+            settings = settings.with_value(path, _with_margin(noise, own), "the sensor's calibration")
     return settings
 
 
@@ -140,8 +141,7 @@ def with_range_noise(settings: Settings, scans: Iterable[LidarScan]) -> tuple[Se
         scans: scans of the recording; the first ones with rings decide, mostly the first one alone.
     """
     recipe, lidar = recipe_named(settings.recipe), settings.params().lidar
-    uses_imu = isinstance(settings.config, InertialConfig) and settings.config.imu.use
-    if not recipe.noise_from_recording or not uses_imu or _RANGE in settings.given:
+    if not recipe.noise_from_recording or not uses_imu(settings) or _RANGE in settings.given:
         return settings, []
     with_rings = (scan for scan in islice(scans, _SCANS_WITH_RINGS) if (scan.ring >= 0).any())
     # one by one: a recording that breaks off early is read no further than needed

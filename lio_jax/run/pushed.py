@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from lio_jax.data.imu_checks import LARGEST
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
 from lio_jax.data.trajectory import Trajectory
-from lio_jax.run.run import feed_of, settings_for, uses_imu
+from lio_jax.run.run import feed_of, settings_for
 from lio_jax.run.scan_inputs import ImuFeed, InputsInTurn
 from lio_jax.run.track import CompiledStep, ResultBuilder, ScanResult, StepsInTurn, on_host
-from lio_jax.settings.settings import Settings
+from lio_jax.settings.settings import Settings, uses_imu
 
 _PATIENCE_NS = 500_000_000
 """A scan waits for its inertial samples until data arrive whose stamps are later than its end by this."""

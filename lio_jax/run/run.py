@@ -34,7 +34,7 @@ from lio_jax.run.sinks import RunResult, Sink, finish_all
 from lio_jax.run.state_files import ImuRateFile, StateFiles
 from lio_jax.run.track import CompiledStep, ScanResult, track
 from lio_jax.run.verdict import Verdict
-from lio_jax.settings.settings import Settings, with_extrinsics
+from lio_jax.settings.settings import Settings, uses_imu, with_extrinsics
 
 
 def settings_for(sequence: Sequence, settings: Settings) -> tuple[Settings, list[str]]:
@@ -199,11 +199,6 @@ def imu_feed(sequence: Sequence, settings: Settings) -> tuple[ImuFeed | None, tu
         return None, ()
     imu, found = cleaned(recorded, "IMU", sequence.info.T_imu_lidar)
     return feed_of(imu, settings), found
-
-
-def uses_imu(settings: Settings) -> bool:
-    """Return whether the recipe takes inertial samples and is to use them."""
-    return isinstance(settings.config, InertialConfig) and settings.config.imu.use
 
 
 def feed_of(imu: ImuData | None, settings: Settings) -> ImuFeed:

@@ -23,7 +23,7 @@ from lio_jax.core.errors import UsageError
 from lio_jax.core.files import parse_yaml, read_text
 from lio_jax.core.leaf import Declared, Setting, choices, numbers_of, settings_of, traced
 from lio_jax.recipes import RECIPES, AnyRecipe, full_name, recipe_named
-from lio_jax.recipes.params import RecipeConfig, RecipeParams
+from lio_jax.recipes.params import InertialConfig, RecipeConfig, RecipeParams
 from lio_jax.settings.shared import GlobalParams, RunConfig
 
 Values = dict[str, dict[str, Any]]
@@ -110,6 +110,11 @@ class Settings:
 def recipe_of(settings: Settings) -> AnyRecipe:
     """Return the recipe that settings name, with their static config."""
     return recipe_named(settings.recipe)(settings.config)
+
+
+def uses_imu(settings: Settings) -> bool:
+    """Return whether the recipe takes inertial samples and is to use them."""
+    return isinstance(settings.config, InertialConfig) and settings.config.imu.use
 
 
 def recipe_settings(recipe: str, source: str = "") -> Settings:
