@@ -24,6 +24,7 @@ _EPOCH_NS = (10**17, 4 * 10**18)
 """Whole numbers that lie between these as ns, us or ms since 1970 are such times: the years 1973 to 2096."""
 _NO_COUNTER_STEPS = 1_000
 _SHORTEST_STEP_NS = 1_000_000
+_NAMED_AT_MOST = 6
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,8 @@ def stamps_of(folder: Path, files: Sequence[Path], period: float) -> CloudStamps
         period: time between scans without stamps, s.
 
     Raises:
-        LioJaxError: the times file does not fit the clouds, or some names hold numbers and others do not.
+        LioJaxError: the times file does not fit the clouds, some names hold numbers and others do not, or
+            the files are of several series.
     """
     period_ns = round(period * 1e9)
     times = next((folder / name for name in TIMES_FILES if (folder / name).is_file()), None)
@@ -62,6 +64,7 @@ def stamps_of(folder: Path, files: Sequence[Path], period: float) -> CloudStamps
     if stamps := _named_seconds(names) or _named_pairs(names):
         return _sorted(files, stamps, False, "stamps: seconds in the names of the files")
     numbers = _numbers(folder, names)
+    _check_one_series(folder, names)
     if numbers is None:
         return _counted(sorted(files, key=_natural), period, "in the order of their names")
     tick_ns = whole_tick_ns(numbers, period_ns)
@@ -149,6 +152,23 @@ def _numbers(folder: Path, names: Sequence[str]) -> list[int] | None:
                 f"or give the stamps of all clouds in {TIMES_FILES[0]}."
             )
     return [int(match.group(1)) for match in found if match]
+
+
+def _check_one_series(folder: Path, names: Sequence[str]) -> None:
+    """Raise an error where several series of files share most of their numbers (raw_0, map_0)."""
+    series: dict[str, set[int]] = {}
+    for name in names:
+        if match := _LAST_NUMBER.search(name):
+            series.setdefault(name[: match.start()], set()).add(int(match.group(1)))
+    different = len(set[int]().union(*series.values()))
+    repeated = sum(map(len, series.values())) - different
+    if 2 * repeated <= different:
+        return
+    named = ", ".join(f"'{text}'" for text in sorted(series)[:_NAMED_AT_MOST])
+    raise LioJaxError(
+        f"{folder}: its clouds are of several series with the same numbers ({named}); give a folder with one "
+        "file for each scan."
+    )
 
 
 def _by_times(times: Path, files: Sequence[Path], period_ns: int) -> CloudStamps:

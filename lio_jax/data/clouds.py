@@ -28,6 +28,7 @@ from lio_jax.data.sequence import (
 )
 from lio_jax.data.time_order import Stamped, ascending, in_time_order
 from lio_jax.data.trajectory import Trajectory, read_kitti_poses, read_tum
+from lio_jax.data.velodyne_file import BYTES_PER_POINT
 
 _IMU_FILES = ("imu.csv", "imu.txt")
 _POSES = "poses.txt"
@@ -44,8 +45,8 @@ class CloudFolder:
         """Order the files in time, and settle from the first clouds how they are read.
 
         Raises:
-            LioJaxError: files of several kinds, times that do not fit, no cloud that can be read, or a field
-                that is not there.
+            LioJaxError: files of several kinds or series, times that do not fit, no cloud that can be
+                read, or a field that is not there.
         """
         self._path, self._config = path, config
         self._log = WarningLog()
@@ -107,7 +108,18 @@ class CloudFolder:
                 "for each scan."
             )
         (files,) = kinds.values()
+        if ".bin" in kinds:
+            self._check_rows(files)
         return stamps_of(self._path, files, self._config.scan_period)
+
+    def _check_rows(self, files: list[Path]) -> None:
+        """Raise an error where most files cannot be rows of a KITTI scan; a few may be truncated."""
+        cut = [file for file in files if file.stat().st_size % BYTES_PER_POINT]
+        if len(cut) > max(1, len(files) // 2):
+            raise LioJaxError(
+                f"{self._path}: {len(cut)} of its {len(files)} .bin files hold no whole rows of x, y, z and "
+                f"intensity (float32, {BYTES_PER_POINT} bytes); convert the scans to .npy with named fields."
+            )
 
     def _recognised(self) -> tuple[ScanReading, list[RawCloud]]:
         """Return how the clouds are read, and the first clouds."""

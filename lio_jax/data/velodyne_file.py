@@ -12,7 +12,8 @@ from lio_jax.data.config import DataConfig
 from lio_jax.data.reconstruct import ring_from_azimuth_wraps, ring_from_elevation
 from lio_jax.data.sequence import check_still_there
 
-_BYTES_PER_POINT = 16
+BYTES_PER_POINT = 16
+"""Size of one row x, y, z, intensity in float32."""
 _HDL64_BEAMS = 64
 
 
@@ -124,15 +125,15 @@ def elevation_note(config: DataConfig) -> list[str]:
 def _read_binary(path: Path, warn: Callable[[str], None]) -> NDArray[np.float32]:
     size = path.stat().st_size
     _check_size(path, size, warn)
-    return np.fromfile(path, np.float32, count=size // _BYTES_PER_POINT * 4).reshape(-1, 4)
+    return np.fromfile(path, np.float32, count=size // BYTES_PER_POINT * 4).reshape(-1, 4)
 
 
 def _check_size(path: Path, size: int, warn: Callable[[str], None]) -> None:
     if size == 0:
         warn(f"{path}: the file is empty (0 bytes): an empty scan.")
-    elif size % _BYTES_PER_POINT:
+    elif size % BYTES_PER_POINT:
         warn(
-            f"{path}: truncated ({size} bytes, no multiple of {_BYTES_PER_POINT}): its whole points are used."
+            f"{path}: truncated ({size} bytes, no multiple of {BYTES_PER_POINT}): its whole points are used."
         )
 
 

@@ -213,6 +213,25 @@ def test_a_name_without_number_among_numbers_is_an_error(tmp_path: Path) -> None
         opened(folder(tmp_path, ["1.pcd", "2.pcd", "map.pcd"]))
 
 
+def test_several_series_with_the_same_numbers_are_an_error(tmp_path: Path) -> None:
+    path = folder(tmp_path, ["raw_0.pcd", "raw_1.pcd", "map_0.pcd", "map_1.pcd"])
+    with pytest.raises(LioJaxError, match=r"several series with the same numbers \('map_', 'raw_'\)"):
+        opened(path)
+
+
+def test_one_stray_copy_is_a_duplicate(tmp_path: Path) -> None:
+    sequence = opened(folder(tmp_path, ["raw_0.pcd", "raw_1.pcd", "raw_2.pcd", "old_1.pcd"]))
+    assert len(list(sequence.scans())) == 3
+    assert "has the same stamp as" in sequence.warnings_so_far[0]
+
+
+def test_rows_of_another_size_are_an_error(tmp_path: Path) -> None:
+    # x, y, z alone
+    path = folder(tmp_path, ["0.bin", "1.bin", "2.bin"], bytes(12 * 1001))
+    with pytest.raises(LioJaxError, match=r"3 of its 3 \.bin files hold no whole rows of x, y, z"):
+        opened(path)
+
+
 def test_equal_stamps_are_dropped_and_named(tmp_path: Path) -> None:
     sequence = opened(folder(tmp_path, ["a_12.5.pcd", "b_12.5.pcd", "c_12.6.pcd"]))
     assert len(list(sequence.scans())) == 2
