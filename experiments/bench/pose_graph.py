@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _SYSTEMS = ("ours", "gtsam", "odometry")
 RECORDED = ("sphere2500", "parking-garage")
-_RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "data" / "g2o"
+RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "data" / "g2o"
 
 
 def main() -> None:
@@ -63,13 +63,14 @@ def main() -> None:
 def _graphs() -> "dict[str, Callable[[], PoseGraph]]":
     graphs: dict[str, Callable[[], PoseGraph]] = {}
     for name in RECORDED:
-        path = _RECORDINGS / f"{name}.g2o"
+        path = RECORDINGS / f"{name}.g2o"
         if path.is_file():
-            graphs[name] = lambda path=path: _read(path)
-    return graphs | {"torus5000": _torus, "chain4500": _chain}
+            graphs[name] = lambda path=path: read(path)
+    return graphs | {"torus5000": torus, "chain4500": chain}
 
 
-def _read(path: Path) -> "PoseGraph":
+def read(path: Path) -> "PoseGraph":
+    """Read a g2o file; its first vertex is fixed."""
     import equinox as eqx
     import jax.numpy as jnp
 
@@ -79,7 +80,7 @@ def _read(path: Path) -> "PoseGraph":
     return eqx.tree_at(lambda graph: graph.fixed, graph, jnp.arange(len(graph.fixed)) == 0)
 
 
-def _torus() -> "PoseGraph":
+def torus() -> "PoseGraph":
     """Return 5,000 poses that wind around a torus, each joined to its neighbour in the previous winding."""
     around, across = 100, 50
     count = around * across
@@ -91,7 +92,7 @@ def _torus() -> "PoseGraph":
     return _simulated(t, pairs, np.array([0.02] * 3 + [0.05] * 3))
 
 
-def _chain() -> "PoseGraph":
+def chain() -> "PoseGraph":
     """Return 4,500 keyframes, 1 m apart, of laps through a town, with 100 loops between the laps."""
     count, rounds = 4500, 9
     phase = 2 * np.pi * rounds * np.arange(count) / count

@@ -13,10 +13,10 @@ from lio_jax.commands.runtime import say
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.pose_graph.chordal import chordal_poses
 from lio_jax.pose_graph.g2o import G2oFile, read_g2o, write_graph
-from lio_jax.pose_graph.graduated import Robust
 from lio_jax.pose_graph.graph import LOOP, Solution
 from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError
 from lio_jax.pose_graph.pose_graph import compile_for, solve
+from lio_jax.pose_graph.robust import Robust
 from lio_jax.pose_graph.structure import structure_of
 
 _NAMED = 5

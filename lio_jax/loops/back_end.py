@@ -22,7 +22,6 @@ from lio_jax.loops.gps import Fix, GpsGate, Refusal, alignment
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.loops.params import BackEndSettings
 from lio_jax.loops.verification import Verdict
-from lio_jax.pose_graph.graduated import Robust
 from lio_jax.pose_graph.graph import (
     LOOP,
     ODOMETRY,
@@ -34,6 +33,7 @@ from lio_jax.pose_graph.graph import (
     poses_from,
 )
 from lio_jax.pose_graph.pose_graph import solve
+from lio_jax.pose_graph.robust import Robust
 
 _Array = NDArray[np.float64]
 

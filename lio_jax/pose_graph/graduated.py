@@ -1,24 +1,18 @@
 """Reject edges that contradict the others, by graduated non-convexity."""
 
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
-from lio_jax.pose_graph.chordal import chordal_poses, edges_at
 from lio_jax.pose_graph.descent import (
     Descent,
     Limits,
     Padded,
     descend,
-    padded_poses,
     padded_weights,
     places_in,
 )
-from lio_jax.pose_graph.graph import ODOMETRY, POSITION, PRIOR, PoseGraph, Poses
-from lio_jax.pose_graph.structure import Structure, parts_of, structure_of
+from lio_jax.pose_graph.graph import PoseGraph, Poses
+from lio_jax.pose_graph.structure import Structure, structure_of
 
 _Array = NDArray[np.float64]
 
@@ -34,32 +28,16 @@ _SETTLED = 1e-3
 """Distance from 0 or 1 below which a weight counts as final."""
 
 
-@dataclass(frozen=True)
-class Robust:
-    """Which edges may be wrong, and how large the residual of a correct edge may be."""
-
-    confidence: float = 0.99
-    """Share of correct edges whose r' Omega r is below the limit, by the chi-square distribution."""
-    trusted_kinds: tuple[int, ...] = (ODOMETRY, PRIOR)
-    """Kinds of edges that are taken to be correct."""
-    begin: Literal["trusted", "given"] = "trusted"
-    """Poses of the first residuals. "trusted": the poses that agree best with the trusted edges; this finds
-    the correct edges among many wrong ones. "given": the given poses, for example the best ones with all
-    edges; this finds a few wrong edges if all correct ones contradict the trusted edges in the same way."""
-
-
-class Graduated(NamedTuple):
-    """The result of the graduation."""
-
-    descent: Descent
-    """The last descent, with the count of iterations of all descents."""
-    weights: _Array
-    """(e,) weight of each edge, 0 or 1 and rarely between."""
-
-
 def graduate(
-    graph: PoseGraph, structure: Structure, padded: Padded, poses: Poses, robust: Robust, limits: Limits
-) -> Graduated:
+    graph: PoseGraph,
+    structure: Structure,
+    padded: Padded,
+    poses: Poses,
+    doubted: NDArray[np.bool_],
+    begin: _Array,
+    limit: _Array,
+    limits: Limits,
+) -> tuple[Descent, _Array]:
     """Return poses and weights of a truncated least-squares problem, beginning with a convex approximation.
 
     This is GNC-TLS of Yang, Antonante, Tzoumas & Carlone, "Graduated non-convexity for robust spatial
@@ -69,22 +47,17 @@ def graduate(
         graph: vertices and edges, without padding.
         structure: structure of the graph.
         padded: the graph at its padded size.
-        poses: first poses, at the padded size. They are used if ``robust.begin`` is "given", or if the
-            trusted edges do not connect all vertices.
-        robust: which edges may be wrong.
+        poses: first poses, at the padded size.
+        doubted: (e,) edges that may be wrong.
+        begin: (e,) weights of the edges for the first residuals.
+        limit: (e,) r' Omega r above which an edge counts as wrong.
         limits: conditions that end the last descent, which has the final weights.
+
+    Returns:
+        The last descent, with the count of iterations of all descents, and the (e,) weight of each edge, 0 or
+        1 and rarely between.
     """
-    doubted = ~np.isin(structure.kind, robust.trusted_kinds)
-    size = np.where(
-        structure.kind == POSITION, 3 if structure.tangent_size == 6 else 2, structure.tangent_size
-    )
-    limit = chi2.ppf(robust.confidence, size)
-    weights = np.where(doubted, 0.0, 1.0)
-    start = _poses_of_trusted(graph, structure, ~doubted) if robust.begin == "trusted" else None
-    if start is None:
-        weights[:] = 1.0
-    else:
-        poses = padded_poses(start, len(padded.graph.fixed))
+    weights = begin.copy()
 
     def solved(poses: Poses, limits: Limits) -> Descent:
         """Descend with the current weights; edges of weight 0 cause no fill-in."""
@@ -108,7 +81,7 @@ def graduate(
             break
         control *= _GROWTH
     descent = solved(descent.point.poses, limits)
-    return Graduated(descent._replace(iterations=iterations + descent.iterations), weights)
+    return descent._replace(iterations=iterations + descent.iterations), weights
 
 
 def truncated_weights(squared: _Array, control: float) -> _Array:
@@ -126,11 +99,3 @@ def truncated_weights(squared: _Array, control: float) -> _Array:
     between = np.sqrt(control * (control + 1) / np.maximum(squared, np.finfo(float).tiny)) - control
     between = np.where(squared >= (control + 1) / control, 0.0, between)
     return np.where(squared <= control / (control + 1), 1.0, between)
-
-
-def _poses_of_trusted(graph: PoseGraph, structure: Structure, trusted: NDArray[np.bool_]) -> Poses | None:
-    i, j = structure.i[trusted], structure.j[trusted]
-    if parts_of(len(structure.held), i, j).max(initial=-1) + 1 != structure.parts:
-        return None
-    alone = edges_at(graph, np.flatnonzero(trusted))
-    return chordal_poses(alone, structure_of(alone))

@@ -31,9 +31,9 @@ from lio_jax.pose_graph.descent import (
     padded_weights,
     point_after,
 )
-from lio_jax.pose_graph.graduated import Robust, graduate
 from lio_jax.pose_graph.graph import PoseGraph, Poses, Solution
 from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError, one_thread
+from lio_jax.pose_graph.robust import Robust, solve_robustly
 from lio_jax.pose_graph.structure import Structure, structure_of
 
 _VERTICES_AT_ONCE = 64
@@ -86,7 +86,7 @@ def _solve(
         with suppress(NotPositiveDefiniteError):
             poses = padded_poses(chordal_poses(graph, structure), len(whole.graph.fixed))
     if robust is not None:
-        descent, weights = graduate(graph, structure, whole, poses, robust, limits)
+        descent, weights = solve_robustly(graph, structure, whole, poses, robust, limits)
     else:
         weights = np.ones(len(structure.i))
         descent = descend(whole, structure, poses, padded_weights(weights, whole), limits)

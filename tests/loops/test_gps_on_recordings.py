@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 from lio_jax.data.detect import open_sequence
 from lio_jax.data.gps_checks import cleaned
 from lio_jax.loops.gps import Fix, GpsGate, Refusal, alignment
-from lio_jax.pose_graph.graduated import Robust
 from lio_jax.pose_graph.graph import ODOMETRY, POSITION, PoseGraph, poses_from, translations
 from lio_jax.pose_graph.pose_graph import solve
+from lio_jax.pose_graph.robust import Robust
 from lio_jax.settings.settings import Settings
 from tests.shared_data import SHARED_DATA, needs_shared
 

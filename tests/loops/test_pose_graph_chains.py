@@ -8,10 +8,10 @@ import pytest
 
 from lio_jax.pose_graph.chordal import edges_at
 from lio_jax.pose_graph.descent import Equations, Limits, padded, padded_weights, point_after
-from lio_jax.pose_graph.graduated import Robust
 from lio_jax.pose_graph.graph import LOOP, ODOMETRY, numbers_of
 from lio_jax.pose_graph.pose_derivative import solved_poses
 from lio_jax.pose_graph.pose_graph import solve
+from lio_jax.pose_graph.robust import Robust
 from lio_jax.pose_graph.structure import structure_of
 from tests.loops.agreement import agrees_on_covariances
 from tests.loops.graphs import (

@@ -1,0 +1,339 @@
+"""Select the loops of a pose graph that agree, those first which a wrong loop could hardly imitate.
+
+A loop is compared with the poses that the edges accepted so far determine. Its residual has the covariance
+S = Omega^-1 + P, where P is the covariance of the relative pose of its ends (the innovation of a filter). A
+short loop has a small S, so a wrong loop there agrees by chance only rarely; a loop over a long drift agrees
+with anything. Loops are accepted in the order of that chance, as long as few of those accepted are expected
+to be wrong. Each acceptance makes the graph stiffer and the next loops easier to judge. Accepted loops that
+the solution contradicts are dropped again.
+
+The idea to accept measurements by their joint consistency is that of Neira & Tardos, "Data association in
+stochastic mapping using the joint compatibility test", T-RA 2001, and of Latif, Cadena & Neira, "Robust loop
+closing over time for pose graph SLAM", IJRR 2013. The order by the chance of a false agreement is our own.
+"""
+
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+from scipy.stats import chi2
+
+from lio_jax.pose_graph.chordal import chordal_poses, edges_at
+from lio_jax.pose_graph.descent import (
+    Descent,
+    Limits,
+    Padded,
+    descend,
+    padded_poses,
+    padded_weights,
+    places_in,
+    point_after,
+)
+from lio_jax.pose_graph.factors import residuals
+from lio_jax.pose_graph.graph import PoseGraph, Poses, picked
+from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError
+from lio_jax.pose_graph.path_covariance import path_covariances
+from lio_jax.pose_graph.structure import Structure, structure_of
+
+_Array = NDArray[np.float64]
+
+_EXPECTED_WRONG = (2e-4, 1e-3, 5e-3, 2e-2)
+"""Expected shares of wrong loops among those accepted in one round; the strictest one that accepts enough."""
+_EXPECTED_WRONG_AS_STATED = _EXPECTED_WRONG[:3]
+"""The same, where the residuals may be as large as the stated information allows."""
+_ENOUGH = 0.05
+"""Least share of the loops that agree which a round accepts before the next expected share is tried."""
+_ROUNDS = 200
+"""Largest number of rounds."""
+_CHANCES = 2
+"""Number of times that a loop may be dropped before it is left out for good."""
+_FEW = 0.25
+"""Number of doubted edges, over that of the trusted ones, up to which all are tried at once: many wrong loops
+would couple everything with everything, and the solve would take long."""
+_ON_THE_WAY = Limits(iterations=50, tolerance=1e-4)
+"""Conditions that end the descents before the last one."""
+_WORST = 0.25
+"""Loops are dropped together if their residual is above this share of the largest."""
+_FALSE_LOOPS = 4096
+"""Number of drawn false loops whose residuals state how a wrong loop scatters."""
+_STATED = 60.0
+"""Degrees of freedom with which the stated information counts in the estimate of the noise."""
+_HALVINGS = 24
+"""Number of variances of the noise that are compared in the first round, each half of the one before."""
+_ALMOST_ALL = 0.9
+"""Share of the right loops that agree with the variance of the first round."""
+_TRIALS = 10
+"""Largest number of loops that are tried for the sake of others."""
+_TRIED = 0.05
+"""Largest chance of a false agreement of a loop that is tried."""
+_SUPPORT = 3.0, 10.0, 1e-3
+"""A tried loop stays if it lets this number of others agree, and this multiple of those expected by chance,
+where only loops count that agree by chance with less than the last number."""
+
+
+def select(
+    graph: PoseGraph,
+    structure: Structure,
+    padded: Padded,
+    poses: Poses,
+    doubted: NDArray[np.bool_],
+    confidence: float,
+    limits: Limits,
+) -> tuple[Descent, _Array]:
+    """Return the poses of the edges that agree.
+
+    The noise may be smaller than stated, as it is in many graphs; its variance is estimated from the accepted
+    edges, and a loop must agree with it. At the end loops are accepted, too, that agree with the information
+    as it is stated.
+
+    Args:
+        graph: vertices and edges, without padding.
+        structure: structure of the graph.
+        padded: the graph at its padded size.
+        poses: poses of the trusted edges, at the padded size.
+        doubted: (e,) edges between two vertices that may be wrong; the others connect all vertices.
+        confidence: share of correct edges whose r' Omega r is below the limit, by the chi-square
+            distribution.
+        limits: conditions that end the last descent.
+
+    Returns:
+        The last descent, with the count of iterations of all descents, and the (e,) weight of each edge: 1 if
+        it agrees, else 0.
+    """
+    problem = _Problem(graph, structure, padded, doubted, confidence)
+    state = _State(~doubted, poses, 1.0, 0)
+    together = _all_agree(problem, state) if np.sum(doubted) <= _FEW * np.sum(~doubted) else None
+    if together is not None:
+        state = together
+    else:
+        state = _grown(problem, state, _EXPECTED_WRONG, stated=False)
+        state = _grown(problem, state._replace(variance=1.0), _EXPECTED_WRONG_AS_STATED, stated=True)
+    descent = _solved(problem, state.kept, state.poses, limits)
+    iterations = state.iterations + descent.iterations
+    return descent._replace(iterations=iterations), state.kept.astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    graph: PoseGraph
+    structure: Structure
+    padded: Padded
+    doubted: NDArray[np.bool_]
+    confidence: float
+
+    @property
+    def size(self) -> int:
+        return self.structure.tangent_size
+
+    @cached_property
+    def limit(self) -> float:
+        return float(chi2.ppf(self.confidence, self.size))
+
+    @cached_property
+    def covariance(self) -> _Array:
+        return np.linalg.inv(np.asarray(self.graph.information, np.float64))
+
+    @cached_property
+    def false_loops(self) -> PoseGraph:
+        """Doubted measurements between vertices that are drawn at random."""
+        rng = np.random.default_rng(0)
+        drawn = edges_at(self.graph, rng.choice(np.flatnonzero(self.doubted), _FALSE_LOOPS))
+        ends = rng.integers(0, len(self.structure.held), (2, _FALSE_LOOPS)).astype(self.structure.i.dtype)
+        return eqx.tree_at(lambda graph: (graph.i, graph.j), drawn, (ends[0], ends[1]))
+
+
+class _State(NamedTuple):
+    kept: NDArray[np.bool_]
+    """(e,) accepted edges."""
+    poses: Poses
+    """Their solution, at the padded size."""
+    variance: float
+    """Variance of the noise, over the stated one."""
+    iterations: int
+
+
+class _Innovations(NamedTuple):
+    squared: _Array
+    """(k,) r' S^-1 r of each loop."""
+    S: _Array
+    """(k, d, d) covariances of the residuals."""
+    false: _Array
+    """(d, d) second moment of the residuals of false loops."""
+
+    def chance(self, limit: float, variance: float) -> _Array:
+        """Return the (k,) probabilities that a false loop, normally distributed, has r' S^-1 r below a limit.
+
+        The density is taken to be that at zero, which is right for small probabilities.
+        """
+        size = len(self.false)
+        volume = size / 2 * np.log(limit / 2) - gammaln(size / 2 + 1)
+        S = variance * self.S
+        among = np.linalg.slogdet(S)[1] - np.linalg.slogdet(S + self.false)[1]
+        return np.exp(np.minimum(volume + among / 2, 0.0))
+
+
+def _all_agree(problem: _Problem, state: _State) -> _State | None:
+    """Return the state with all edges; None if one of them contradicts the others."""
+    kept = np.ones(len(state.kept), bool)
+    descent = _solved(problem, kept, _better_start(problem, kept, state.poses), _ON_THE_WAY)
+    squared = 2 * np.asarray(descent.point.edge_costs)[: len(kept)]
+    if np.any(squared[problem.doubted] > problem.limit):
+        return None
+    return _State(kept, descent.point.poses, 1.0, descent.iterations)
+
+
+def _grown(problem: _Problem, state: _State, shares: tuple[float, ...], stated: bool) -> _State:
+    """Accept loops round by round, until no more can be told from wrong ones."""
+    dropped = np.zeros(len(state.kept), np.int64)
+    trials = 0 if stated else _TRIALS
+    first = not stated
+    for _ in range(_ROUNDS):
+        waiting = np.flatnonzero(problem.doubted & ~state.kept & (dropped < _CHANCES))
+        if not len(waiting):
+            break
+        found = _innovations(problem, state, waiting)
+        if first:
+            state, first = state._replace(variance=_first_variance(found, problem)), False
+        chance = found.chance(problem.limit, state.variance)
+        agrees = found.squared <= problem.limit * state.variance
+        chosen = waiting[_sure(chance, agrees, shares)]
+        if not len(chosen) and np.all(agrees):
+            # nothing contradicts anything
+            chosen = waiting
+        if len(chosen):
+            after = _accepting(problem, state, chosen, stated)
+        else:
+            hopeful = np.flatnonzero(agrees & (chance < _TRIED))
+            hopeful = waiting[hopeful[np.argsort(chance[hopeful], kind="stable")]]
+            after, used = _supported(problem, state, hopeful[:trials], waiting[chance < _SUPPORT[2]])
+            dropped[hopeful[:used]] = _CHANCES
+            trials -= used
+            if after is state:
+                break
+        dropped[(state.kept | np.isin(np.arange(len(dropped)), chosen)) & ~after.kept] += 1
+        state = after
+    return state
+
+
+def _sure(chance: _Array, agrees: NDArray[np.bool_], shares: tuple[float, ...]) -> NDArray[np.int64]:
+    """Return the agreeing loops up to a chance at which few of them are expected to be wrong."""
+    order = np.argsort(chance, kind="stable")
+    false, good = np.cumsum(chance[order]), np.cumsum(agrees[order])
+    last: NDArray[np.int64] = np.zeros(0, np.int64)
+    for share in shares:
+        last = np.flatnonzero((false <= share * good) & agrees[order])
+        if len(last) and good[last[-1]] >= _ENOUGH * good[-1]:
+            break
+    if not len(last):
+        return last
+    taken = order[: last[-1] + 1]
+    return taken[agrees[taken]]
+
+
+def _supported(
+    problem: _Problem, state: _State, hopeful: NDArray[np.int64], sure: NDArray[np.int64]
+) -> tuple[_State, int]:
+    """Try loops until one lets others agree; return the state with it, and the number of loops tried.
+
+    Loops at the end of a long drift cannot be told from wrong ones alone. A right one makes its neighbours
+    agree, a wrong one does not.
+
+    Args:
+        problem: the graph.
+        state: edges accepted so far.
+        hopeful: loops to try, in this order.
+        sure: loops that could be judged without the tried one.
+    """
+    least, multiple, chance_below = _SUPPORT
+    for tried, loop in enumerate(hopeful):
+        after = _accepting(problem, state, np.array([loop]), stated=False)
+        if not after.kept[loop]:
+            continue
+        others = np.flatnonzero(problem.doubted & ~after.kept)
+        others = others[~np.isin(others, sure)]
+        if not len(others):
+            continue
+        found = _innovations(problem, after, others)
+        chance = found.chance(problem.limit, after.variance)
+        judged = chance < chance_below
+        support = np.sum(judged & (found.squared <= problem.limit * after.variance))
+        if support >= least + multiple * np.sum(chance[judged]):
+            return after, tried
+    return state, len(hopeful)
+
+
+def _accepting(problem: _Problem, state: _State, more: NDArray[np.int64], stated: bool) -> _State:
+    """Accept loops, solve, and drop those that the solution contradicts, the worst first."""
+    kept = state.kept.copy()
+    kept[more] = True
+    poses, variance, iterations = _better_start(problem, kept, state.poses), state.variance, state.iterations
+    while True:
+        descent = _solved(problem, kept, poses, _ON_THE_WAY)
+        poses, iterations = descent.point.poses, iterations + descent.iterations
+        squared = 2 * np.asarray(descent.point.edge_costs)[: len(kept)]
+        loops = kept & problem.doubted
+        if not stated:
+            freedom = problem.size * np.sum(loops)
+            variance = min(1.0, float((squared[kept].sum() + _STATED) / (freedom + _STATED)))
+        largest = squared[loops].max(initial=0.0)
+        if largest <= problem.limit * variance:
+            return _State(kept, poses, variance, iterations)
+        kept = kept & ~(loops & (squared > max(problem.limit * variance, _WORST * largest)))
+
+
+def _better_start(problem: _Problem, kept: NDArray[np.bool_], poses: Poses) -> Poses:
+    """Return the given poses, or those that the kept edges suggest, whichever have the lower cost."""
+    used = structure_of(problem.graph, kept)
+    with suppress(NotPositiveDefiniteError):
+        guess = chordal_poses(problem.graph, used, kept.astype(np.float64))
+        guess = padded_poses(guess, len(problem.padded.graph.fixed))
+        padded = problem.padded._replace(places=places_in(used))
+        weights = padded_weights(kept.astype(np.float64), padded)
+        still = jax.device_put(np.zeros((len(padded.places.unknown) + 1, problem.size)))
+        costs = [float(point_after(each, still, weights, padded).cost) for each in (guess, poses)]
+        if costs[0] < costs[1]:
+            return guess
+    return poses
+
+
+def _solved(problem: _Problem, kept: NDArray[np.bool_], poses: Poses, limits: Limits) -> Descent:
+    """Descend with the kept edges only; the others cause no fill-in."""
+    structure = structure_of(problem.graph, kept)
+    padded = problem.padded._replace(places=places_in(structure))
+    return descend(padded, structure, poses, padded_weights(kept.astype(np.float64), padded), limits)
+
+
+def _innovations(problem: _Problem, state: _State, loops: NDArray[np.int64]) -> _Innovations:
+    graph = problem.padded.graph
+    P = path_covariances(graph, problem.structure, problem.covariance, state.poses, state.kept, loops)
+    S = problem.covariance[loops] + P
+    r = np.asarray(_residuals(state.poses, graph))[loops]
+    false = np.asarray(_residuals(state.poses, problem.false_loops))
+    squared = np.einsum("ei,ei->e", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])
+    return _Innovations(squared, S, false.T @ false / len(false))
+
+
+@jax.jit
+def _residuals(poses: Poses, graph: PoseGraph) -> jax.Array:
+    return residuals(picked(poses, graph.i), picked(poses, graph.j), graph)
+
+
+def _first_variance(found: _Innovations, problem: _Problem) -> float:
+    """Return the variance of the noise, before any loop is accepted, over the stated one.
+
+    Below the true variance right loops do not agree. Above it none but wrong ones are added, and these no
+    more often than by chance. So the least variance is taken with almost the largest number of loops that
+    agree, less those expected by chance.
+    """
+    variances = 2.0 ** -np.arange(_HALVINGS)
+    excess = [
+        np.sum(found.squared <= problem.limit * variance) - np.sum(found.chance(problem.limit, variance))
+        for variance in variances
+    ]
+    return float(variances[np.flatnonzero(excess >= _ALMOST_ALL * np.max(excess))[-1]])
