@@ -18,6 +18,8 @@ _Array = NDArray[np.float64]
 
 _SOURCES_AT_ONCE = 256
 """Number of vertices whose paths are found at once; the table of predecessors has a row for each."""
+_LONGEST = 1e100
+"""Greatest length of an edge; a path may need an edge without information."""
 
 
 @jax.jit
@@ -64,6 +66,7 @@ def path_covariances(
     variances = np.diagonal(covariance, axis1=1, axis2=2)
     arm = position[:count].var(0).sum() / 4
     length = variances[:, turns:].sum(1) + arm * variances[:, :turns].sum(1)
+    length = np.nan_to_num(np.minimum(length, _LONGEST), nan=_LONGEST)
     total = _along_paths(structure, in_world, length, used, wanted)
     back = from_world[wanted]
     return back @ total @ back.transpose(0, 2, 1)

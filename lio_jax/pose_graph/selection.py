@@ -60,6 +60,8 @@ _ON_THE_WAY = Limits(iterations=50, tolerance=1e-4)
 """Conditions that end the descents before the last one."""
 _WORST = 0.25
 """Loops are dropped together if their residual is above this share of the largest."""
+_FARTHEST = 1e9
+"""Largest residual that is distinguished from others, m."""
 _FALSE_LOOPS = 4096
 """Number of drawn false loops whose residuals state how a wrong loop scatters."""
 _STATED = 60.0
@@ -68,6 +70,8 @@ _HALVINGS = 24
 """Number of variances of the noise that are compared in the first round, each half of the one before."""
 _ALMOST_ALL = 0.9
 """Share of the right loops that agree with the variance of the first round."""
+_OPEN = 1e-12
+"""Least eigenvalue of an information matrix, over its largest, that counts as information."""
 _TRIALS = 10
 """Largest number of loops that are tried for the sake of others."""
 _TRIED = 0.05
@@ -112,8 +116,10 @@ def select(
     if together is not None:
         state = together
     else:
-        state = _grown(problem, state, _EXPECTED_WRONG, stated=False)
-        state = _grown(problem, state._replace(variance=1.0), _EXPECTED_WRONG_AS_STATED, stated=True)
+        # a damaged file may place vertices beyond all numbers
+        with np.errstate(over="ignore", invalid="ignore"):
+            state = _grown(problem, state, _EXPECTED_WRONG, stated=False)
+            state = _grown(problem, state._replace(variance=1.0), _EXPECTED_WRONG_AS_STATED, stated=True)
     descent = _solved(problem, state.kept, state.poses, limits)
     iterations = state.iterations + descent.iterations
     return descent._replace(iterations=iterations), state.kept.astype(np.float64)
@@ -137,7 +143,10 @@ class _Problem:
 
     @cached_property
     def covariance(self) -> _Array:
-        return np.linalg.inv(np.asarray(self.graph.information, np.float64))
+        values, vectors = np.linalg.eigh(np.asarray(self.graph.information, np.float64))
+        # a direction without information is open, not exact
+        values = np.maximum(values, np.maximum(_OPEN * values[:, -1:], np.finfo(np.float64).tiny ** 0.5))
+        return (vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1)
 
     @cached_property
     def false_loops(self) -> PoseGraph:
@@ -175,7 +184,8 @@ class _Innovations(NamedTuple):
         volume = size / 2 * np.log(limit / 2) - gammaln(size / 2 + 1)
         S = variance * self.S
         among = np.linalg.slogdet(S)[1] - np.linalg.slogdet(S + self.false)[1]
-        return np.exp(np.minimum(volume + among / 2, 0.0))
+        # poses beyond all numbers let anything agree
+        return np.nan_to_num(np.exp(np.minimum(volume + among / 2, 0.0)), nan=1.0)
 
 
 def _all_agree(problem: _Problem, state: _State) -> _State | None:
@@ -313,8 +323,10 @@ def _innovations(problem: _Problem, state: _State, loops: NDArray[np.int64]) -> 
     graph = problem.padded.graph
     P = path_covariances(graph, problem.structure, problem.covariance, state.poses, state.kept, loops)
     S = problem.covariance[loops] + P
-    r = np.asarray(_residuals(state.poses, graph))[loops]
-    false = np.asarray(_residuals(state.poses, problem.false_loops))
+    r, false = (
+        np.clip(_residuals(state.poses, each), -_FARTHEST, _FARTHEST) for each in (graph, problem.false_loops)
+    )
+    r = r[loops]
     squared = np.einsum("ei,ei->e", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])
     return _Innovations(squared, S, false.T @ false / len(false))
 
@@ -336,4 +348,5 @@ def _first_variance(found: _Innovations, problem: _Problem) -> float:
         np.sum(found.squared <= problem.limit * variance) - np.sum(found.chance(problem.limit, variance))
         for variance in variances
     ]
-    return float(variances[np.flatnonzero(excess >= _ALMOST_ALL * np.max(excess))[-1]])
+    enough = np.array(excess) >= _ALMOST_ALL * max(np.max(excess), 0.0)
+    return float(variances[np.flatnonzero(enough)[-1]]) if np.any(enough) else 1.0

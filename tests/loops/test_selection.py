@@ -1,13 +1,14 @@
 """Loops that agree are selected among wrong ones, on long chains of uneven information."""
 
 import equinox as eqx
+import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.pose_graph.chordal import edges_at
-from lio_jax.pose_graph.graph import LOOP, poses_from, translations
+from lio_jax.pose_graph.graph import LOOP, numbers_of, poses_from, translations
 from lio_jax.pose_graph.path_covariance import path_covariances
 from lio_jax.pose_graph.pose_graph import marginal_covariances, solve
 from lio_jax.pose_graph.robust import Robust
@@ -96,3 +97,14 @@ def test_the_covariance_along_a_chain_is_the_marginal_one(group):
     solution = solve(alone)
     exact = marginal_covariances(alone, solution, [12, 29])
     np.testing.assert_allclose(found, exact, rtol=1e-6, atol=1e-9 * np.abs(exact).max())
+
+
+def test_vertices_beyond_all_numbers_leave_a_result(recwarn):
+    """A damaged file may state any number; nothing is printed but what the command says."""
+    rng = np.random.default_rng(2)
+    _, clean = uneven_chain(jaxlie.SE2, rng)
+    numbers = np.array(numbers_of(clean.measurement))
+    numbers[[5, 120, -1], -1] = 1e160, -1e160, 1e160
+    graph = eqx.tree_at(lambda graph: graph.measurement, clean, jaxlie.SE2(jnp.asarray(numbers)))
+    assert len(solve(graph, robust=Robust()).weights) == len(clean.i)
+    assert not recwarn.list
