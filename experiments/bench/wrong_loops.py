@@ -95,7 +95,8 @@ def spoilt(graph: "PoseGraph", kind: str, share: float, rng: np.random.Generator
     """
     import jax.numpy as jnp
 
-    from lio_jax.pose_graph.graph import LOOP, PoseGraph, numbers_of
+    from lio_jax.pose_graph.graph import LOOP, numbers_of
+    from tests.loops.graphs import with_edges
 
     loops = np.flatnonzero(np.asarray(graph.kind) == LOOP)
     vertices, count = len(graph.fixed), round(len(loops) * share / (1 - share))
@@ -111,18 +112,8 @@ def spoilt(graph: "PoseGraph", kind: str, share: float, rng: np.random.Generator
     if kind == "random":
         measured = _random_poses(numbers_of(graph.poses), count, rng)
 
-    def longer(leaf: object, more: np.ndarray) -> "jnp.ndarray":
-        return jnp.concatenate([jnp.asarray(leaf), jnp.asarray(more, jnp.asarray(leaf).dtype)])
-
-    return PoseGraph(
-        graph.poses,
-        longer(graph.i, ends.min(1)),
-        longer(graph.j, ends.max(1)),
-        type(graph.measurement)(longer(numbers_of(graph.measurement), measured)),
-        longer(graph.information, np.asarray(graph.information)[source]),
-        longer(graph.kind, np.full(count, LOOP)),
-        graph.fixed,
-    )
+    poses = type(graph.measurement)(jnp.asarray(measured))
+    return with_edges(graph, ends.min(1), ends.max(1), poses, np.asarray(graph.information)[source], LOOP)
 
 
 def _random_poses(among: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:

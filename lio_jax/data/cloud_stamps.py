@@ -64,7 +64,6 @@ def stamps_of(folder: Path, files: Sequence[Path], period: float) -> CloudStamps
     if stamps := _named_seconds(names) or _named_pairs(names):
         return _sorted(files, stamps, False, "stamps: seconds in the names of the files")
     numbers = _numbers(folder, names)
-    _check_one_series(folder, names)
     if numbers is None:
         return _counted(sorted(files, key=_natural), period, "in the order of their names")
     tick_ns = whole_tick_ns(numbers, period_ns)
@@ -151,15 +150,16 @@ def _numbers(folder: Path, names: Sequence[str]) -> list[int] | None:
                 f"{folder}: the name '{name}' holds no number, as other names do; move this file elsewhere, "
                 f"or give the stamps of all clouds in {TIMES_FILES[0]}."
             )
-    return [int(match.group(1)) for match in found if match]
+    matches = [match for match in found if match]
+    _check_one_series(folder, matches)
+    return [int(match.group(1)) for match in matches]
 
 
-def _check_one_series(folder: Path, names: Sequence[str]) -> None:
+def _check_one_series(folder: Path, numbers: Sequence[re.Match[str]]) -> None:
     """Raise an error where several series of files share most of their numbers (raw_0, map_0)."""
     series: dict[str, set[int]] = {}
-    for name in names:
-        if match := _LAST_NUMBER.search(name):
-            series.setdefault(name[: match.start()], set()).add(int(match.group(1)))
+    for match in numbers:
+        series.setdefault(match.string[: match.start()], set()).add(int(match.group(1)))
     different = len(set[int]().union(*series.values()))
     repeated = sum(map(len, series.values())) - different
     if 2 * repeated <= different:

@@ -17,7 +17,7 @@ from lio_jax.pose_graph.block_cholesky import factorise, solve
 from lio_jax.pose_graph.factors import linearise
 from lio_jax.pose_graph.graph import PoseGraph, Poses, Status, moved, numbers_of
 from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError
-from lio_jax.pose_graph.structure import Structure
+from lio_jax.pose_graph.structure import Structure, structure_of
 
 
 class Places(NamedTuple):
@@ -159,6 +159,31 @@ def point_after(
     )
 
 
+def point_at(poses: Poses, weights: Float[Array, " e"], padded: Padded) -> Point:
+    """Return the normal equations at the given poses.
+
+    Args:
+        poses: (n,) T_world_vertex at the padded size, m.
+        weights: factor of each edge's information, at the padded size.
+        padded: the graph.
+    """
+    information = padded.graph.information
+    still = np.zeros((len(padded.places.unknown) + 1, information.shape[-1]), information.dtype)
+    return point_after(poses, jax.device_put(still), weights, padded)
+
+
+def restricted(graph: PoseGraph, padded: Padded, used: NDArray[np.bool_]) -> tuple[Padded, Structure]:
+    """Return a padded graph and its structure with some edges only; the others cause no fill-in.
+
+    Args:
+        graph: vertices and edges, without padding.
+        padded: the graph at its padded size.
+        used: (e,) edges that are used; the weights of the others must be zero.
+    """
+    structure = structure_of(graph, used)
+    return padded._replace(places=places_in(structure)), structure
+
+
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-10, 1e8
 """Bounds of the damping, relative to the diagonal of the normal equations."""
 _FAITHFUL = 0.5
@@ -209,7 +234,7 @@ def descend(
         limits: conditions that end the descent.
     """
     step = np.zeros((len(padded.places.unknown) + 1, structure.tangent_size), padded.graph.information.dtype)
-    point = point_after(poses, jax.device_put(step), weights, padded)
+    point = point_at(poses, weights, padded)
     cost, damping, iterations = float(point.cost), 0.0, 0
     if not np.isfinite(cost):
         return Descent(point, 0, "not finite")

@@ -9,10 +9,10 @@ from lio_jax.pose_graph.descent import (
     Padded,
     descend,
     padded_weights,
-    places_in,
+    restricted,
 )
 from lio_jax.pose_graph.graph import PoseGraph, Poses
-from lio_jax.pose_graph.structure import Structure, structure_of
+from lio_jax.pose_graph.structure import Structure
 
 _Array = NDArray[np.float64]
 
@@ -63,8 +63,7 @@ def graduate(
         """Descend with the current weights; edges of weight 0 cause no fill-in."""
         nonlocal padded, structure
         if np.sum(weights > 0) < _SHRUNK * np.sum(structure.used) or np.any((weights > 0) & ~structure.used):
-            structure = structure_of(graph, weights > 0)
-            padded = padded._replace(places=places_in(structure))
+            padded, structure = restricted(graph, padded, weights > 0)
         return descend(padded, structure, poses, padded_weights(weights, padded), limits)
 
     descent = solved(poses, _ON_THE_WAY)

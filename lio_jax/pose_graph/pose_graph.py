@@ -23,13 +23,11 @@ from lio_jax.pose_graph.chordal import chordal_poses
 from lio_jax.pose_graph.descent import (
     Equations,
     Limits,
-    Padded,
-    Point,
     descend,
     padded,
     padded_poses,
     padded_weights,
-    point_after,
+    point_at,
 )
 from lio_jax.pose_graph.graph import PoseGraph, Poses, Solution
 from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError, one_thread
@@ -66,9 +64,8 @@ def solve(
 
 def compile_for(graph: PoseGraph) -> None:
     """Compile the programs for a solve of this graph, unless a graph of the same padded size has done so."""
-    structure = structure_of(graph)
-    whole = padded(graph, structure)
-    jax.block_until_ready(_point(whole, structure, whole.graph.poses, np.ones(len(structure.i))))
+    whole = padded(graph, structure_of(graph))
+    jax.block_until_ready(point_at(whole.graph.poses, padded_weights(np.ones(len(graph.i)), whole), whole))
 
 
 def _solve(
@@ -79,7 +76,7 @@ def _solve(
     structure: Structure,
 ) -> Solution:
     whole = padded(graph, structure)
-    own = _point(whole, structure, whole.graph.poses, np.ones(len(structure.i)))
+    own = point_at(whole.graph.poses, padded_weights(np.ones(len(structure.i)), whole), whole)
     poses = whole.graph.poses
     if start == "chordal":
         # weights of very different size leave no guess; the graph's own poses are one, too
@@ -131,7 +128,8 @@ def marginal_covariances(
     structure = structure or structure_of(graph)
     whole = padded(graph, structure)
     poses = padded_poses(solution.poses, len(whole.graph.fixed))
-    equations = Equations.at(_point(whole, structure, poses, np.asarray(solution.weights)), structure)
+    weights = padded_weights(np.asarray(solution.weights), whole)
+    equations = Equations.at(point_at(poses, weights, whole), structure)
     size = structure.tangent_size
     covariances = np.zeros((len(vertices), size, size))
     unknown = structure.unknown[np.asarray(vertices, np.int64)]
@@ -152,11 +150,6 @@ def marginal_covariances(
     if np.any(variances * own > _SINGULAR):
         raise LioJaxError(_OPEN_POSE)
     return covariances
-
-
-def _point(whole: Padded, structure: Structure, poses: Poses, weights: NDArray[np.float64]) -> Point:
-    still = np.zeros((len(whole.places.unknown) + 1, structure.tangent_size), whole.graph.information.dtype)
-    return point_after(poses, jax.device_put(still), padded_weights(weights, whole), whole)
 
 
 def _unpadded(poses: Poses, count: int) -> Poses:

@@ -32,14 +32,14 @@ from lio_jax.pose_graph.descent import (
     descend,
     padded_poses,
     padded_weights,
-    places_in,
-    point_after,
+    point_at,
+    restricted,
 )
 from lio_jax.pose_graph.factors import residuals
 from lio_jax.pose_graph.graph import PoseGraph, Poses, picked
 from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError
 from lio_jax.pose_graph.path_covariance import path_covariances
-from lio_jax.pose_graph.structure import Structure, structure_of
+from lio_jax.pose_graph.structure import Structure
 
 _Array = NDArray[np.float64]
 
@@ -120,7 +120,7 @@ def select(
         with np.errstate(over="ignore", invalid="ignore"):
             state = _grown(problem, state, _EXPECTED_WRONG, stated=False)
             state = _grown(problem, state._replace(variance=1.0), _EXPECTED_WRONG_AS_STATED, stated=True)
-    descent = _solved(problem, state.kept, state.poses, limits)
+    descent = _solved(problem, state.kept, state.poses, limits, anew=False)
     iterations = state.iterations + descent.iterations
     return descent._replace(iterations=iterations), state.kept.astype(np.float64)
 
@@ -191,7 +191,7 @@ class _Innovations(NamedTuple):
 def _all_agree(problem: _Problem, state: _State) -> _State | None:
     """Return the state with all edges; None if one of them contradicts the others."""
     kept = np.ones(len(state.kept), bool)
-    descent = _solved(problem, kept, _better_start(problem, kept, state.poses), _ON_THE_WAY)
+    descent = _solved(problem, kept, state.poses, _ON_THE_WAY, anew=True)
     squared = 2 * np.asarray(descent.point.edge_costs)[: len(kept)]
     if np.any(squared[problem.doubted] > problem.limit):
         return None
@@ -202,14 +202,13 @@ def _grown(problem: _Problem, state: _State, shares: tuple[float, ...], stated: 
     """Accept loops round by round, until no more can be told from wrong ones."""
     dropped = np.zeros(len(state.kept), np.int64)
     trials = 0 if stated else _TRIALS
-    first = not stated
-    for _ in range(_ROUNDS):
+    for number in range(_ROUNDS):
         waiting = np.flatnonzero(problem.doubted & ~state.kept & (dropped < _CHANCES))
         if not len(waiting):
             break
         found = _innovations(problem, state, waiting)
-        if first:
-            state, first = state._replace(variance=_first_variance(found, problem)), False
+        if number == 0 and not stated:
+            state = state._replace(variance=_first_variance(found, problem))
         chance = found.chance(problem.limit, state.variance)
         agrees = found.squared <= problem.limit * state.variance
         chosen = waiting[_sure(chance, agrees, shares)]
@@ -226,7 +225,9 @@ def _grown(problem: _Problem, state: _State, shares: tuple[float, ...], stated: 
             trials -= used
             if after is state:
                 break
-        dropped[(state.kept | np.isin(np.arange(len(dropped)), chosen)) & ~after.kept] += 1
+        tried = state.kept.copy()
+        tried[chosen] = True
+        dropped[tried & ~after.kept] += 1
         state = after
     return state
 
@@ -282,10 +283,11 @@ def _accepting(problem: _Problem, state: _State, more: NDArray[np.int64], stated
     """Accept loops, solve, and drop those that the solution contradicts, the worst first."""
     kept = state.kept.copy()
     kept[more] = True
-    poses, variance, iterations = _better_start(problem, kept, state.poses), state.variance, state.iterations
+    poses, variance, iterations = state.poses, state.variance, state.iterations
+    anew = True
     while True:
-        descent = _solved(problem, kept, poses, _ON_THE_WAY)
-        poses, iterations = descent.point.poses, iterations + descent.iterations
+        descent = _solved(problem, kept, poses, _ON_THE_WAY, anew)
+        poses, iterations, anew = descent.point.poses, iterations + descent.iterations, False
         squared = 2 * np.asarray(descent.point.edge_costs)[: len(kept)]
         loops = kept & problem.doubted
         if not stated:
@@ -297,26 +299,26 @@ def _accepting(problem: _Problem, state: _State, more: NDArray[np.int64], stated
         kept = kept & ~(loops & (squared > max(problem.limit * variance, _WORST * largest)))
 
 
-def _better_start(problem: _Problem, kept: NDArray[np.bool_], poses: Poses) -> Poses:
-    """Return the given poses, or those that the kept edges suggest, whichever have the lower cost."""
-    used = structure_of(problem.graph, kept)
-    with suppress(NotPositiveDefiniteError):
-        guess = chordal_poses(problem.graph, used, kept.astype(np.float64))
-        guess = padded_poses(guess, len(problem.padded.graph.fixed))
-        padded = problem.padded._replace(places=places_in(used))
-        weights = padded_weights(kept.astype(np.float64), padded)
-        still = jax.device_put(np.zeros((len(padded.places.unknown) + 1, problem.size)))
-        costs = [float(point_after(each, still, weights, padded).cost) for each in (guess, poses)]
-        if costs[0] < costs[1]:
-            return guess
-    return poses
+def _solved(problem: _Problem, kept: NDArray[np.bool_], poses: Poses, limits: Limits, anew: bool) -> Descent:
+    """Descend with the kept edges only.
 
-
-def _solved(problem: _Problem, kept: NDArray[np.bool_], poses: Poses, limits: Limits) -> Descent:
-    """Descend with the kept edges only; the others cause no fill-in."""
-    structure = structure_of(problem.graph, kept)
-    padded = problem.padded._replace(places=places_in(structure))
-    return descend(padded, structure, poses, padded_weights(kept.astype(np.float64), padded), limits)
+    Args:
+        problem: the graph.
+        kept: (e,) edges that are used.
+        poses: poses to start from, at the padded size.
+        limits: conditions that end the descent.
+        anew: start from the poses that the kept edges suggest, where their cost is lower.
+    """
+    padded, structure = restricted(problem.graph, problem.padded, kept)
+    weights = kept.astype(np.float64)
+    at_padded_size = padded_weights(weights, padded)
+    if anew:
+        with suppress(NotPositiveDefiniteError):
+            guess = chordal_poses(problem.graph, structure, weights)
+            guess = padded_poses(guess, len(padded.graph.fixed))
+            costs = [float(point_at(each, at_padded_size, padded).cost) for each in (guess, poses)]
+            poses = guess if costs[0] < costs[1] else poses
+    return descend(padded, structure, poses, at_padded_size, limits)
 
 
 def _innovations(problem: _Problem, state: _State, loops: NDArray[np.int64]) -> _Innovations:
