@@ -15,6 +15,9 @@ from nbclient import NotebookClient
 def main(source: Path, target: Path) -> None:
     # the notebooks call the command lio-jax of this environment
     os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    # they import the pictures' module beside them
+    places = [str(source.resolve()), os.environ.get("PYTHONPATH", "")]
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, places))
     target.mkdir(parents=True, exist_ok=True)
     for path in sorted(source.glob("*.ipynb")):
         notebook = nbformat.read(path, as_version=4)

@@ -17,6 +17,7 @@ PICTURES = {
     "04_ablation": 1,
     "05_your_own_bag": 2,
     "06_calibrate_a_lidar": 2,
+    "07_write_a_recipe": 2,
 }
 
 
@@ -24,9 +25,10 @@ PICTURES = {
 def kernel(tmp_path, monkeypatch):
     """Set a kernel's environment: this installation's commands, and no settings of the user."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    places = [str(ROOT), str(ROOT / "notebooks"), os.environ.get("PYTHONPATH", "")]
     environment = {
         "PATH": path,
-        "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
+        "PYTHONPATH": os.pathsep.join(filter(None, places)),
         "IPYTHONDIR": str(tmp_path / "ipython"),
     }
     for name, value in environment.items():
