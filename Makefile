@@ -43,9 +43,13 @@ docs: $(VENV)/.installed-dev
 docs-notebooks: $(VENV)/.installed-dev
 	$(BIN)/python docs/hooks/execute_notebooks.py notebooks out/notebooks
 
-# The pictures of the pages, made anew by the simulator.
+# The pictures of the pages, made anew by the simulator. With DRIVE=.../2011_09_26_drive_0005_sync, that of KITTI, too.
+GALLERY := $(filter-out docs/gallery/picture.py docs/gallery/kitti.py,$(wildcard docs/gallery/*.py))
+DRIVE ?=
 figures: $(VENV)/.installed-dev
 	$(BIN)/python docs/figures/symptoms.py
+	set -e; for script in $(GALLERY); do $(BIN)/python $$script; done
+	$(if $(DRIVE),$(BIN)/python docs/gallery/kitti.py $(DRIVE))
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
