@@ -134,8 +134,8 @@ def stage_times(stages: Mapping[str, Array]) -> None:
     """
     figure, (bars, over) = _panels(1, 2, 3.2, width_ratios=(1, 1.4))
     medians = [float(np.median(ms)) for ms in stages.values()]
-    bars.barh(list(stages), medians, color=[f"C{place}" for place in range(len(stages))])
-    bars.bar_label(bars.containers[0], fmt=" %.2g ms")
+    drawn = bars.barh(list(stages), medians, color=[f"C{place}" for place in range(len(stages))])
+    bars.bar_label(drawn, fmt=" %.2g ms")
     bars.set(xlabel="median [ms]", xlim=(0, 1.45 * max(medians)))
     bars.invert_yaxis()
     for name, ms in stages.items():
@@ -240,7 +240,8 @@ def residuals(cases: Mapping[str, Array]) -> None:
     """
     figure, (histogram, below) = _panels(1, 2, 4.0)
     for (label, distance), color in zip(cases.items(), ("C3", "C1", "C0"), strict=True):
-        histogram.hist(distance, np.linspace(-25, 25, 101), histtype="step", linewidth=1.3, color=color)
+        bins = np.linspace(-25, 25, 101).tolist()
+        histogram.hist(distance, bins, histtype="step", linewidth=1.3, color=color)
         below.plot(np.sort(np.abs(distance)), np.linspace(0, 100, len(distance)), color=color, label=label)
     histogram.set(xlabel="distance from the plane [cm]", ylabel="points", yscale="log")
     below.set(xlabel="|distance| less than [cm]", ylabel="points [%]", xlim=(0, 25), ylim=(0, 100))
