@@ -75,6 +75,7 @@ from .tuning.objectives import MeanOverScans as MeanOverScans
 from .tuning.objectives import objective_named as objective_named
 from .tuning.optimise import Bounds as Bounds
 from .tuning.optimise import fisher_scoring as fisher_scoring
+from .tuning.optimise import parameter_covariance as parameter_covariance
 from .tuning.optimise import stationary as stationary
 from .tuning.parameters import free_parameters as free_parameters
 from .tuning.recording import Recording as Recording

@@ -76,14 +76,61 @@ def fisher_scoring(evaluate: Evaluate, x: Vector, bounds: Bounds, iterations: in
 def fisher_information(result: Evaluated) -> NDArray[np.float64]:
     """Return the scores' spread about their mean, regular where a parameter has no effect.
 
-    About their mean: what all scans ask for alike, the gradient, tells nothing of the curvature. Scans that
-    did not count have no score, not one of zero.
+    About their mean: what all scans ask for alike, the gradient, tells nothing of the curvature.
     """
-    assert result.scores is not None, "scoring needs the scans' scores"
-    scores = result.scores[np.any(result.scores != 0, axis=1)]
-    away = scores - np.sum(scores, axis=0) / max(len(scores), 1)
+    away = _about_their_mean(result)
     information = away.T @ away
     return information + np.diag(np.where(np.diag(information) > 0, 1e-9 * np.diag(information), 1.0))
+
+
+def parameter_covariance(result: Evaluated) -> NDArray[np.float64]:
+    """Return the covariance of a likelihood's maximum, for scores that are correlated from scan to scan.
+
+    Successive scans meet the same surfaces and share the map's errors, so a hundred scans tell less than a
+    hundred independent ones. The inverse information stands on both sides of the scores' long-run spread
+    (White, "Maximum likelihood estimation of misspecified models", 1982), which has Bartlett's weights over
+    the lags (Newey & West 1987) up to the lag that suits the correlation of neighbours (Andrews 1991,
+    equations 5.3 and 6.4). A lag over the end of a recording counts like any other.
+
+    Args:
+        result: the likelihood at its maximum, with the scores of all scans in their order.
+
+    Returns:
+        (p, p) covariance of the vector of parameters.
+    """
+    information = fisher_information(result)
+    scores = _about_their_mean(result)
+    long_run = information.copy()
+    lags = _lags(scores)
+    for lag in range(1, lags + 1):
+        product = scores[lag:].T @ scores[:-lag]
+        long_run += (1 - lag / (lags + 1)) * (product + product.T)
+    inverse = np.linalg.inv(information)
+    return np.asarray(inverse @ long_run @ inverse, np.float64)
+
+
+_STRONGEST_CORRELATION = 0.97
+"""Largest correlation of neighbouring scores from which the number of lags is found."""
+_MOST_LAGS = 1 / 4
+"""Largest number of lags, relative to the number of scans."""
+
+
+def _lags(scores: NDArray[np.float64]) -> int:
+    """Return the number of lags by Andrews' rule for Bartlett's weights, each parameter's scores an AR(1)."""
+    power = np.sum(scores**2, axis=0)
+    neighbours = np.sum(scores[1:] * scores[:-1], axis=0)[power > 0] / power[power > 0]
+    if not len(neighbours):
+        return 0
+    r = np.clip(neighbours, -_STRONGEST_CORRELATION, _STRONGEST_CORRELATION)
+    alpha = np.sum(4 * r**2 / ((1 - r) ** 6 * (1 + r) ** 2)) / np.sum((1 - r) ** -4)
+    return int(min(math.ceil(1.1447 * (alpha * len(scores)) ** (1 / 3)), _MOST_LAGS * len(scores)))
+
+
+def _about_their_mean(result: Evaluated) -> NDArray[np.float64]:
+    """Return the scores of the scans that count, less their mean; a scan that does not count has zeros."""
+    assert result.scores is not None, "scoring needs the scans' scores"
+    scores = result.scores[np.any(result.scores != 0, axis=1)]
+    return np.asarray(scores - np.sum(scores, axis=0) / max(len(scores), 1), np.float64)
 
 
 def lbfgsb(evaluate: Evaluate, x: Vector, bounds: Bounds, iterations: int) -> None:

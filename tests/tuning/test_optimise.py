@@ -8,7 +8,15 @@ from scipy.stats import multivariate_normal
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.tuning.gradient import Evaluated
-from lio_jax.tuning.optimise import Bounds, adam, fisher_information, fisher_scoring, lbfgsb, stationary
+from lio_jax.tuning.optimise import (
+    Bounds,
+    adam,
+    fisher_information,
+    fisher_scoring,
+    lbfgsb,
+    parameter_covariance,
+    stationary,
+)
 from lio_jax.tuning.parameters import free_parameters
 from lio_jax.tuning.session import HISTORY, Session
 from tests.params import default_params
@@ -105,10 +113,45 @@ def test_the_fisher_information_gives_the_standard_deviation():
     np.testing.assert_allclose(sigma * np.sqrt(len(SAMPLES) / 200), spread, rtol=0.15)
 
 
+@pytest.mark.parametrize("correlation", [0.0, 0.6, 0.9])
+def test_intervals_hold_the_truth_where_scans_are_correlated(correlation):
+    """The mean of an AR(1) process of variance 4: intervals from its scores, in 400 draws of 400 scans."""
+    random, held, held_if_independent = np.random.default_rng(7), 0, 0
+    for _ in range(400):
+        noise = random.normal(size=(500, 1)) * np.sqrt(1 - correlation**2)
+        for place in range(1, len(noise)):
+            noise[place] += correlation * noise[place - 1]
+        scores = noise[100:] / 2.0
+        result = Evaluated(0.0, scores.mean(0), scores, 0, 400)
+        # the maximum of the likelihood lies off the truth by the mean of the scores over the curvature
+        error = float(scores.sum()) * 4.0 / 400
+        held += abs(error) < 1.96 * float(parameter_covariance(result)[0, 0]) ** 0.5
+        held_if_independent += (
+            abs(error) < 1.96 * float(np.linalg.inv(fisher_information(result))[0, 0]) ** 0.5
+        )
+    assert held >= 0.85 * 400
+    if correlation:
+        assert held_if_independent < 0.75 * 400
+
+
+def test_the_covariance_of_independent_scores_is_the_inverse_information():
+    result = noise_likelihood(BEST)
+    covariance = parameter_covariance(result)
+    np.testing.assert_allclose(
+        np.diag(covariance), np.diag(np.linalg.inv(fisher_information(result))), rtol=0.1
+    )
+    silent = np.insert(result.scores, [100, 2000], 0.0, axis=0)
+    with_lost_scans = Evaluated(0.0, silent.mean(0), silent, 0, len(silent))
+    np.testing.assert_allclose(parameter_covariance(with_lost_scans), covariance, rtol=1e-12)
+
+
 def test_a_parameter_without_effect_leaves_the_information_regular():
     scores = np.random.default_rng(3).normal(size=(50, 2)) * [1.0, 0.0]
-    inverse = np.linalg.inv(fisher_information(Evaluated(0.0, scores.mean(0), scores, 0, 50)))
-    assert np.isfinite(inverse).all()
+    result = Evaluated(0.0, scores.mean(0), scores, 0, 50)
+    assert np.isfinite(np.linalg.inv(fisher_information(result))).all()
+    covariance = parameter_covariance(result)
+    assert covariance[1, 1] == pytest.approx(1.0)
+    assert np.isfinite(covariance).all()
 
 
 FREE = free_parameters(default_params(), ["imu.gyro_noise", "lidar.range_sigma"])
@@ -178,6 +221,14 @@ def test_a_start_that_is_not_finite_is_refused(tmp_path):
 
     with pytest.raises(LioJaxError, match="not finite at the start"):
         session(tmp_path, broken).run("scoring", BEST, WIDE, 5, 0)
+
+
+def test_a_recording_of_which_no_scan_counts_is_refused(tmp_path):
+    def silent(x, recordings):
+        return Evaluated(0.0, np.zeros(2), np.zeros((10, 2)), 0, 10)
+
+    with pytest.raises(LioJaxError, match="none of the 10 scans tells of the parameters"):
+        session(tmp_path, silent).run("scoring", BEST, WIDE, 5, 0)
 
 
 def test_the_information_is_the_scatter_of_the_scores_of_scans_that_count():
