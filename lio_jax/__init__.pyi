@@ -7,11 +7,13 @@ from .core.leaf import leaf as leaf
 from .core.leaf import section as section
 from .core.leaf import static as static
 from .core.types import ImuBatch as ImuBatch
+from .core.types import Scalar as Scalar
 from .core.types import initial_nav_state as initial_nav_state
 from .data import LidarScan as LidarScan
 from .data import Sequence as Sequence
 from .data import Trajectory as Trajectory
 from .data import open_sequence as open_sequence
+from .data.trajectory import read_tum as read_tum
 from .estimation.chain import Chain as Chain
 from .estimation.factors import PoseMeasurement as PoseMeasurement
 from .estimation.marginal_prior import gaussian_prior as gaussian_prior

@@ -24,7 +24,7 @@ Assignments = Annotated[
     arg(name="set", metavar="PATH=VALUE ...", help="Replace settings, e.g. params.map.voxel_size=0.5."),
 ]
 Data = Positional[Annotated[Path, arg(metavar="DATA")]]
-Recipe = Annotated[str | None, arg(metavar="NAME|FILE.yaml")]
+Recipe = Annotated[str | None, arg(metavar="NAME|FILE.yaml|FILE.py:CLASS")]
 ParamsFrom = Annotated[
     Path | None,
     arg(
@@ -129,8 +129,8 @@ def run(
         data: Recording: KITTI odometry sequence or raw drive, ROS bag, folder of clouds, native folder, or
             evalio:NAME.
         out: Folder for the results.
-        recipe: Recipe or settings file; a run's config.yaml repeats that run. None means default, or with
-            --params-from the recipe that follows that system.
+        recipe: Recipe, settings file, or class of your own recipe; a run's config.yaml repeats that run.
+            None means default, or with --params-from the recipe that follows that system.
         start: First scan.
         scans: Number of scans; None means all.
         gt: Ground truth of T_world_imu (TUM, run folder or recording); None means the recording's own.
@@ -282,7 +282,7 @@ def tune(
         params: Parameters, for example imu.gyro_noise,imu.accel_noise, extrinsics.*, or loop.*,gps.* with the
             back end.
         out: Folder for tuned.yaml, history.json and tuning.png; an earlier tuning there is continued.
-        recipe: Recipe or settings file to start from; None as for run.
+        recipe: Recipe, settings file or class of your own recipe to start from; None as for run.
         validate: Recordings that decide which iterate is taken and when to stop.
         gt: Ground truth of T_world_imu; None means the recordings' own.
         optimizer: auto takes scoring for likelihoods, stationary for extrinsics and corrections of points,

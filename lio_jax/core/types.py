@@ -7,6 +7,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
 Scalar = Float[Array, ""]
+"""An array of one number, the type of most parameters."""
 
 
 class Scan(eqx.Module):

@@ -141,7 +141,7 @@ def _choice(paths: list[str]) -> str:
 
 def _may_start(start: eqx.Module, path: str) -> bool:
     value = _leaf(start, path)
-    return value.size > 0 and (_tuned(start, path) != "log" or bool(value > 0))
+    return value.size > 0 and (_tuned(start, path) != "log" or bool(jnp.all(value > 0)))
 
 
 def _has_no_rings(start: eqx.Module, path: str) -> bool:
@@ -167,8 +167,11 @@ def _leaf(params: Any, path: str) -> Array:
 def _component_names(start: eqx.Module, path: str) -> tuple[str, ...]:
     if settings_of(type(start))[path].declared.per_ring:
         return tuple(f"{path}.{ring}" for ring in range(len(_leaf(start, path))))
-    if _leaf(start, path).ndim:
+    value = _leaf(start, path)
+    if _tuned(start, path) == "turn" or value.shape == (3,):
         return tuple(f"{path}.{axis}" for axis in "xyz")
+    if value.ndim:
+        return tuple(f"{path}.{number}" for number in range(value.size))
     return (path,)
 
 
@@ -176,7 +179,7 @@ def _encoded(start: eqx.Module, path: str) -> Float[Array, " k"]:
     value, tuned = _leaf(start, path), _tuned(start, path)
     if tuned == "turn":
         return jnp.zeros(3, value.dtype)
-    return jnp.atleast_1d(jnp.log(value) if tuned == "log" else value)
+    return jnp.ravel(jnp.log(value) if tuned == "log" else value)
 
 
 def _decoded(start: eqx.Module, path: str, x: Float[Array, " k"]) -> Array:

@@ -1,12 +1,14 @@
 """Patterns select a vector of parameters, and the vector is written back."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import UsageError
-from lio_jax.core.leaf import traced
+from lio_jax.core.leaf import leaf, section, traced
 from lio_jax.tuning.parameters import free_parameters
 from tests.params import DEFAULTS, Params, default_params
 
@@ -20,6 +22,27 @@ def test_positive_parameters_are_logarithms_and_the_rest_stays():
     assert float(params.imu.accel_noise) == pytest.approx(3 * float(start.imu.accel_noise))
     assert float(params.lidar.range_sigma) == pytest.approx(0.5 * float(start.lidar.range_sigma))
     assert params.registration == start.registration
+
+
+class Learned(eqx.Module):
+    """Parameters with more than three numbers, as a learned part has them."""
+
+    weights: Float[Array, "5"] = leaf((0.5, -1.0, 0.0, 2.0, 0.25), tuned="linear")
+    scales: Float[Array, "2"] = leaf((0.5, 2.0), above=0, tuned="log")
+
+
+class WithLearned(Params):
+    learned: Learned = section(Learned)
+
+
+def test_a_parameter_may_have_any_number_of_numbers():
+    free = free_parameters(traced(WithLearned), ["learned.*"])
+    assert free.names == (*(f"learned.weights.{n}" for n in range(5)), "learned.scales.0", "learned.scales.1")
+    params = free(free.first() + 1.0)
+    np.testing.assert_allclose(params.learned.weights, [1.5, 0.0, 1.0, 3.0, 1.25])
+    np.testing.assert_allclose(params.learned.scales, np.exp(1) * np.array([0.5, 2.0]))
+    written = free.overrides(np.asarray(free.first()) + 1.0)
+    np.testing.assert_allclose(written["params.learned.weights"], [1.5, 0.0, 1.0, 3.0, 1.25])
 
 
 def test_extrinsics_turn_and_shift_from_their_start():
