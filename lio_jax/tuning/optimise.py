@@ -78,9 +78,7 @@ def fisher_information(result: Evaluated) -> NDArray[np.float64]:
 
     About their mean: what all scans ask for alike, the gradient, tells nothing of the curvature.
     """
-    away = _about_their_mean(result)
-    information = away.T @ away
-    return information + np.diag(np.where(np.diag(information) > 0, 1e-9 * np.diag(information), 1.0))
+    return _spread(_about_their_mean(result))
 
 
 def parameter_covariance(result: Evaluated) -> NDArray[np.float64]:
@@ -98,8 +96,8 @@ def parameter_covariance(result: Evaluated) -> NDArray[np.float64]:
     Returns:
         (p, p) covariance of the vector of parameters.
     """
-    information = fisher_information(result)
     scores = _about_their_mean(result)
+    information = _spread(scores)
     long_run = information.copy()
     lags = _lags(scores)
     for lag in range(1, lags + 1):
@@ -124,6 +122,12 @@ def _lags(scores: NDArray[np.float64]) -> int:
     r = np.clip(neighbours, -_STRONGEST_CORRELATION, _STRONGEST_CORRELATION)
     alpha = np.sum(4 * r**2 / ((1 - r) ** 6 * (1 + r) ** 2)) / np.sum((1 - r) ** -4)
     return int(min(math.ceil(1.1447 * (alpha * len(scores)) ** (1 / 3)), _MOST_LAGS * len(scores)))
+
+
+def _spread(scores: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sum of the scores' products, regular where a parameter has no effect."""
+    spread = scores.T @ scores
+    return np.asarray(spread + np.diag(np.where(np.diag(spread) > 0, 1e-9 * np.diag(spread), 1.0)))
 
 
 def _about_their_mean(result: Evaluated) -> NDArray[np.float64]:
