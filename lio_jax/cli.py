@@ -97,7 +97,7 @@ def inspect(
     """Show a recording's contents, its faults, and the settings that fit it.
 
     Args:
-        data: Recording: KITTI folder, ROS bag, folder of clouds or native folder.
+        data: Recording: KITTI folder, ROS bag, folder of clouds, native folder, or evalio:NAME.
         json: Print one JSON object instead of a table.
         write_config: Write the settings that fit, for --recipe of lio-jax run.
         overwrite: Replace an existing file.
@@ -213,7 +213,7 @@ def export(
     """Write a recording in another format: ROS bag, KITTI odometry sequence or native folder.
 
     Args:
-        data: Recording: KITTI folder, ROS bag, folder of clouds or native folder.
+        data: Recording: KITTI folder, ROS bag, folder of clouds, native folder, or evalio:NAME.
         to: Output format.
         out: Output: *.bag (ROS 1), *.mcap or *.db3 (ROS 2); else a folder.
         layout: Make of the LiDAR whose messages a bag gets: velodyne, ouster or livox.

@@ -184,6 +184,8 @@ def verdict(row: Ranked, baseline: str) -> str:
     """Return the result of the paired test for a variant, in words."""
     if row.variant == baseline:
         return "baseline"
+    if not row.cases:
+        return "no value"
     if math.isnan(row.p_adjusted):
         return "too few pairs" if row.pairs < 2 else "no difference"
     if row.p_adjusted >= SIGNIFICANT:
@@ -223,6 +225,11 @@ def as_text(comparison: VariantComparison) -> str:
     for row in rows:
         first, *rest = zip(row, widths, strict=True)
         lines.append("  ".join([first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in rest)]))
+    if comparison.done and not any(row.cases for row in comparison.rows):
+        lines.append(
+            f"No run has a value of {comparison.metric}. Errors of the trajectory need the true one: give it "
+            "by the key truth of the recording, or rank by another metric, such as failed_scans."
+        )
     return "\n".join(line.rstrip() for line in lines)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.data.config import DataConfig
+from lio_jax.data.imu_faults import unmeasured
 from lio_jax.data.sequence import ImuData
 
 GAP_FACTOR = 5.0
@@ -15,6 +16,11 @@ LARGEST = 1e5
 """A reading above this is a fault of the recording in any unit: 10,000 g in m/s^2."""
 _NAMED_AT_MOST = 3
 _LATE_S = 0.1
+_NONE_LEFT = "no IMU sample is left."
+_STEADY = 0.1
+"""An interval within this share of the median one is regular."""
+_MISSING = 0.02
+"""Smaller shares of missing samples are not named."""
 
 
 def cleaned(
@@ -24,7 +30,9 @@ def cleaned(
 
     Samples are dropped if they are not finite or impossibly large, if they repeat a stamp, or if they step
     back in time. If time steps back, the longest subsequence with ascending time is kept; of several the
-    earliest one. An accelerometer in g is converted. Gaps, saturation, a gyroscope in deg/s and a specific
+    earliest one. Samples that do not measure the motion are dropped too
+    (:func:`lio_jax.data.imu_faults.unmeasured`): spikes, a stuck axis, blocks that are sent again. An
+    accelerometer in g is converted. Gaps, missing samples, saturation, a gyroscope in deg/s and a specific
     force that points down at rest are reported only. Sentences state times in s from the recording's first
     sample.
 
@@ -39,13 +47,17 @@ def cleaned(
     imu = _only(imu, _finite(imu, messages))
     imu = _only(imu, _ascending(imu.stamp_ns, origin, messages))
     if len(imu.stamp_ns) == 0:
-        return imu, tuple(f"{source}: {sentence}" for sentence in [*messages, "no IMU sample is left."])
+        return imu, tuple(f"{source}: {sentence}" for sentence in [*messages, _NONE_LEFT])
     scale, note = accel_scale(imu.accel, DataConfig())
     imu = replace(imu, accel=imu.accel * scale)
+    messages += [f"{note}." if note else "", missing(imu.stamp_ns), gaps(imu.stamp_ns, origin)]
+    bad, sentences = unmeasured(imu, np.asarray((imu.stamp_ns - origin) * 1e-9, np.float64))
+    messages += sentences
+    imu = _only(imu, ~bad)
+    if len(imu.stamp_ns) == 0:
+        return imu, tuple(f"{source}: {sentence}" for sentence in [*messages, _NONE_LEFT] if sentence)
     seconds = np.asarray((imu.stamp_ns - origin) * 1e-9, np.float64)
     messages += [
-        f"{note}." if note else "",
-        gaps(imu.stamp_ns, origin),
         *saturation(imu, seconds),
         degrees_suspected(imu, seconds),
         gravity_sign(imu, seconds, T_imu_lidar),
@@ -217,6 +229,21 @@ def _windowed(
     return np.add.reduceat(values, starts, axis=0) / counts[:, None]
 
 
+def missing(stamp_ns: NDArray[np.int64]) -> str:
+    """Return a sentence on samples that are missing one by one from a regular stream, "" without any."""
+    if len(stamp_ns) < 3:
+        return ""
+    intervals = np.diff(stamp_ns) / np.median(np.diff(stamp_ns))
+    short = intervals[intervals <= GAP_FACTOR]
+    lost = np.rint(short) - 1
+    regular = np.abs(short - np.rint(short)) < _STEADY
+    share = float(lost.sum() / (lost.sum() + len(stamp_ns)))
+    # stamps that jitter say nothing about what lies between them
+    if share < _MISSING or regular.mean() < 1 - _STEADY:
+        return ""
+    return f"{share:.0%} of the IMU samples are missing, up to {int(lost.max())} in a row.".replace("%", " %")
+
+
 def gaps(stamp_ns: NDArray[np.int64], origin_ns: int) -> str:
     """Return a sentence that names the intervals longer than ``GAP_FACTOR`` median ones, "" without any."""
     if len(stamp_ns) < 3:
@@ -233,7 +260,8 @@ def gaps(stamp_ns: NDArray[np.int64], origin_ns: int) -> str:
         more = f" and {len(at) - _NAMED_AT_MOST} more, the longest {intervals.max() * 1e-9:.3f} s"
     return (
         f"{len(at)} gap(s) without IMU samples (usually one every {median * 1e-6:.1f} ms): "
-        f"{', '.join(named)}{more}; scans in there are predicted with little or no inertial data."
+        f"{', '.join(named)}{more}; scans in there are predicted with little or no inertial data. If no "
+        "sample is missing, the IMU's clock jumped by that much."
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lio_jax.core.errors import UsageError
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.evaluation.association import MatchedTrajectories, match_by_index, match_by_time
 from lio_jax.evaluation.kitti_segments import SegmentErrors, kitti_errors, kitti_short_errors
@@ -52,7 +53,7 @@ class Evaluation:
 
 
 def evaluate(
-    estimate: Trajectory, reference: Trajectory, rpe_distances_m: tuple[float, ...] = ()
+    estimate: Trajectory, reference: Trajectory | None, rpe_distances_m: tuple[float, ...] = ()
 ) -> Evaluation:
     """Compare two trajectories of the SAME body frame; their world frames may differ.
 
@@ -62,8 +63,14 @@ def evaluate(
     first.
 
     Raises:
+        UsageError: the reference is None, as the truth of a recording without one is.
         LioJaxError: the time spans do not overlap, or no pose is finite.
     """
+    if reference is None:
+        raise UsageError(
+            "there is no trajectory to compare with: the recording holds no truth, read one from a file with "
+            "lio_jax.read_tum."
+        )
     return _compare(match_by_time(estimate, reference), len(estimate), True, rpe_distances_m)
 
 

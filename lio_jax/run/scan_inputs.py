@@ -61,8 +61,11 @@ def _extended(values: np.ndarray, size: int, dtype: type) -> np.ndarray:
 OFFSET_MARGIN_S = 0.05
 """Largest change of an estimated time offset from its first value for which samples are available, s."""
 
-_BRIDGE_S = 0.5
+_NEAR_S = 0.5
 """A neighbouring sample farther than this from a scan's interval does not describe the motion in it, s."""
+_BRIDGE_S = 5.0
+"""Longest gap between two samples, s, in which the line between them tells of the motion. It is uncertain,
+but in a turn it is far better than none."""
 
 
 class ImuFeed:
@@ -162,7 +165,7 @@ class ImuFeed:
             sentences += coverage(self._imu, *self._span, self._offset_ns * 1e-9)
         if self._without:
             sentences.append(
-                f"{self._without} of {self._scans} scans have no IMU sample within {_BRIDGE_S} s: there the "
+                f"{self._without} of {self._scans} scans have no IMU sample within {_NEAR_S} s: there the "
                 "motion is predicted by constant velocity."
             )
         if self._thinned:
@@ -180,11 +183,18 @@ class ImuFeed:
         first = int(np.searchsorted(self._stamps, start - self._margin_ns, "right")) - 1
         last = int(np.searchsorted(self._stamps, end + self._margin_ns, "left"))
         first, last = max(first, 0), min(last, count - 1)
-        # except where it is beyond a gap
-        reach = self._margin_ns + round(_BRIDGE_S * 1e9)
-        first += int(first < count and self._stamps[first] < start - reach)
-        last -= int(last >= 0 and self._stamps[last] > end + reach)
+        # except where it is far and beyond a long gap
+        reach = self._margin_ns + round(_NEAR_S * 1e9)
+        early = first < count and self._stamps[first] < start - reach and not self._bridged(first)
+        late = last >= 0 and self._stamps[last] > end + reach and not self._bridged(last - 1)
+        first, last = first + early, last - late
         return first, max(last + 1, first)
+
+    def _bridged(self, index: int) -> bool:
+        """Return whether the gap between a sample and the next one is short enough for a line."""
+        if not 0 <= index < len(self._stamps) - 1:
+            return False
+        return bool(self._stamps[index + 1] - self._stamps[index] <= round(_BRIDGE_S * 1e9))
 
     def _padded(self, first: int, last: int, origin_ns: int) -> ImuBatch:
         count = last - first

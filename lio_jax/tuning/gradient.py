@@ -18,7 +18,7 @@ from lio_jax.run.run import settings_for
 from lio_jax.settings.settings import Settings, recipe_of, recipe_settings
 from lio_jax.tuning.corrected import CorrectedLoss, free_of_back_end, names_back_end
 from lio_jax.tuning.evaluated import Evaluated
-from lio_jax.tuning.objectives import Named, Objective, objective_named
+from lio_jax.tuning.objectives import Named, Objective, nothing_counts, objective_named
 from lio_jax.tuning.parameters import ParameterVector, free_parameters
 from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.reverse import TotalGradient, checkpointed_gradient
@@ -75,6 +75,7 @@ def gradient(
 
     Raises:
         UsageError: a parameter, an objective or a mode is not known, or can't be differentiated.
+        LioJaxError: the objective is a likelihood and no scan depends on the parameters.
     """
     if mode not in ("auto", "forward", "reverse"):
         raise UsageError(f"mode '{mode}' is not known; there are: auto, forward, reverse.")
@@ -92,6 +93,8 @@ def gradient(
     forward = mode == "forward" or (mode == "auto" and len(free.names) <= _MOST_FORWARD)
     differentiate = streaming_gradient if forward else checkpointed_gradient
     result = differentiate(recipe, free, named.objective, free.first(), recording, through_map=through_map)
+    if named.likelihood and not result.gradient.any():
+        raise nothing_counts(len(recording))
     return NamedGradient(result.value, _by_name(free, result.gradient), result.unconverged, through_map)
 
 

@@ -12,7 +12,7 @@ import jaxlie
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.errors import UsageError
+from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.core.types import ImuBatch, NavState, Scan, state_dtype
 from lio_jax.lidar.params import BeamParams
 from lio_jax.lidar.range_scatter import range_scatter
@@ -347,6 +347,17 @@ class Named:
 
 OPENING = 10
 """Scans at a recording's start that tell of the first state's sigmas, not of the noise."""
+
+
+def nothing_counts(scans: int) -> LioJaxError:
+    """Return the error of a recording of so many scans in which no scan depends on the parameters."""
+    return LioJaxError(
+        f"none of the {scans} scans tells of the parameters. A likelihood leaves out the scans that could "
+        f"not be matched, and all but ranges leave out the first {OPENING}: use a longer recording, or "
+        "parameters on which the objective depends."
+    )
+
+
 _SINGLE = {
     "pose": Named(MeanOverScans(pose_innovation, OPENING), False, True),
     "point": Named(MeanOverScans(point_innovation, OPENING), False, True),

@@ -17,7 +17,7 @@ from lio_jax.core.files import atomic_path
 from lio_jax.tuning.corrected import CorrectedLoss
 from lio_jax.tuning.evaluated import Evaluated
 from lio_jax.tuning.gradient import Loss
-from lio_jax.tuning.objectives import OPENING
+from lio_jax.tuning.objectives import nothing_counts
 from lio_jax.tuning.optimise import Bounds, adam, fisher_scoring, lbfgsb, parameter_covariance, stationary
 from lio_jax.tuning.parameters import ParameterVector
 from lio_jax.tuning.recording import Recording
@@ -142,11 +142,7 @@ class Session:
                 "the objective is not finite at the start; check the parameters with lio-jax run first."
             )
         if self._likelihood and not self.history and result.scores is not None and not result.scores.any():
-            raise LioJaxError(
-                f"none of the {result.scans} scans tells of the parameters. A likelihood leaves out the "
-                f"first {OPENING} scans of a recording and those that could not be matched: use a longer "
-                "recording, or parameters on which the objective depends."
-            )
+            raise nothing_counts(result.scans)
         sigma = None
         if self._likelihood:
             variance = np.diag(parameter_covariance(result))

@@ -141,8 +141,17 @@ def test_gap_of_half_a_second_is_bridged():
     np.testing.assert_allclose(covered, [4.995 - 5.2, 5.5 - 5.2], atol=1e-9)
 
 
-def test_inside_a_long_gap_there_is_nothing_to_go_by():
+def test_the_line_between_its_ends_bridges_a_gap_of_some_seconds():
     seconds = np.concatenate([np.arange(0, 5, 0.005), np.arange(8, 10, 0.005)])
+    feed = ImuFeed(recorded(seconds), BUCKETS, margin_s=0.0)
+    for at in (5.1, 6.4, 7.9):
+        covered = times(feed, scan_at(at), EPOCH_NS + round(at * 1e9))
+        np.testing.assert_allclose(covered, [4.995 - at, 8.0 - at], atol=1e-6)
+    assert feed.warnings() == []
+
+
+def test_inside_a_long_gap_there_is_nothing_to_go_by():
+    seconds = np.concatenate([np.arange(0, 5, 0.005), np.arange(10.5, 12, 0.005)])
     feed = ImuFeed(recorded(seconds), BUCKETS)
     assert len(times(feed, scan_at(6.4), EPOCH_NS + 6_400_000_000)) == 0
     assert len(times(feed, scan_at(5.3), EPOCH_NS + 5_300_000_000)) == 1
