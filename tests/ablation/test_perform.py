@@ -81,6 +81,7 @@ def test_a_batch_equals_the_runs_one_by_one(tmp_path, monkeypatch):
     assert len(ends) == 4
 
 
+@pytest.mark.long
 def test_a_batch_leaves_what_the_runs_one_by_one_leave(tmp_path):
     """Points agree as recorded, in single precision at their range."""
     tables, names = [], []

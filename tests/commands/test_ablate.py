@@ -85,6 +85,7 @@ def test_smoke(cli, tmp_path):
     assert {entry.name: entry.stat().st_mtime_ns for entry in finished(out)} == before
 
 
+@pytest.mark.long
 def test_a_sequence_that_is_not_there_stops_no_other(cli, tmp_path):
     spec = write_spec(
         tmp_path / "spec.yaml",

@@ -39,6 +39,7 @@ def bag(drive, tmp_path_factory) -> Path:
     return write_bag(path, cloud_messages(path, clouds))
 
 
+@pytest.mark.long
 def test_rings_and_times_are_reconstructed_and_the_drive_is_tracked(cli, bag, drive, tmp_path):
     done = cli("run", bag, "--recipe", "loam", "--out", tmp_path / "out", "--set", *SMALL)
     assert done.status == 0, done.err

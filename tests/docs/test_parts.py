@@ -63,6 +63,7 @@ def test_smoothing_lowers_the_error_as_its_covariance_says(ran):
     assert 0.3 < np.mean((after / sigma) ** 2) < 3.0
 
 
+@pytest.mark.long
 def test_the_derivative_of_the_pose_graph_is_the_difference(ran):
     found = ran("pose_graph")
     end, step = found["end"], 1e-4

@@ -83,6 +83,7 @@ def results(x, recording):
     return jnp.stack(values), found.status
 
 
+@pytest.mark.long
 def test_they_are_central_differences(recording):
     value = quick_jit(results)
     origin = jnp.zeros(len(INPUTS))

@@ -71,6 +71,7 @@ def worker(tmp_path):
     made.close()
 
 
+@pytest.mark.long
 def test_a_command_that_hangs_is_ended(worker, tmp_path, monkeypatch):
     os.mkfifo(tmp_path / "a.tum")
     assert worker.run(["--version"], tmp_path).status == 0

@@ -20,6 +20,7 @@ from gradient_check import with_other_cubes  # isort: skip
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.long
 def test_derivative_and_slope_agree_where_choices_have_no_part(tmp_path):
     recording = write_folder(tmp_path / "drive", moving())
     words = ("--objective", "ranges", "--params", "lidar.range_sigma", "--widths", "0.1", "--draws", "3")

@@ -65,6 +65,7 @@ def test_it_runs_with_its_settings_loops_and_a_report(drive, tmp_path):
     assert (again / "odometry.tum").read_bytes() == (out / "odometry.tum").read_bytes()
 
 
+@pytest.mark.long
 def test_it_is_tuned(drive, tmp_path):
     words = ["--recipe", NAME, "--set", *SMALL, "--params", "lidar.range_sigma", "--objective", "pose"]
     assert main(["tune", str(drive), *words, "--iterations", "2", "--out", str(tmp_path / "tuned")]) == 0
@@ -86,6 +87,7 @@ def test_it_is_ablated(drive, tmp_path):
     assert not compared.failures
 
 
+@pytest.mark.long
 def test_its_gradient_is_the_slope():
     sequence = SimulatedSequence("street", "vlp16", 1.0, seed=1, imu=ImuModel())
     settings = recipe_settings(NAME)

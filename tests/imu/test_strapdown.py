@@ -211,6 +211,7 @@ def reverse():
     return quick_jit(jax.value_and_grad(value, argnums=(0, 1)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("still", [False, True])
 def test_gradients_are_finite_differences(reverse, imu: ImuBatch, still: bool) -> None:
     bias = state(ORIGIN).nav.gyro_bias

@@ -147,6 +147,7 @@ def shift_of(shift, yaw):
     return T
 
 
+@pytest.mark.long
 def test_loops_tie_the_pieces_of_a_map_on_both_sides_of_an_outage(twice_around_a_block):
     keyframes, truth = twice_around_a_block
     middle = len(keyframes) // 2

@@ -70,6 +70,7 @@ def test_derivative_along_a_change_is_the_central_difference(graph, only):
     assert float(jax.grad(along)(0.0)) == pytest.approx(expected, rel=2e-6)
 
 
+@pytest.mark.long
 def test_gradient_by_all_weights(graph):
     def by_weights(logs):
         return loss(
@@ -87,6 +88,7 @@ def test_gradient_by_all_weights(graph):
     np.testing.assert_allclose(jax.jacfwd(by_weights)(logs), gradient, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.long
 def test_gradient_by_positions(graph):
     """The graph has a GPS-like position, whose coordinates move its poses."""
     size, turning = graph.poses.tangent_dim, 3 if graph.poses.tangent_dim == 6 else 1
@@ -105,6 +107,7 @@ def test_gradient_by_positions(graph):
         assert float(gradient[k, 1]) == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.long
 def test_gradient_by_the_lever(graph):
     """Where the antenna sits is found by gradient as well as any other number."""
     size, turning = graph.poses.tangent_dim, 3 if graph.poses.tangent_dim == 6 else 1

@@ -130,6 +130,7 @@ def test_the_same_graph_gives_the_same_bytes(group):
     np.testing.assert_array_equal(numbers_of(first.poses), numbers_of(second.poses))
 
 
+@pytest.mark.long
 def test_derivative_is_the_central_difference():
     graph = chain(jaxlie.SE2, [(3, 80), (20, 60)], 110, noise=5.0)
     rng = np.random.default_rng(7)

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from lio_jax.mapping import point_map
 from lio_jax.mapping.voxel_map import FREE, empty_map, following, insert
@@ -53,6 +54,7 @@ def assert_reverse_agrees(function, at, slope, known):
     np.testing.assert_allclose(backward, expected, rtol=1e-9)
 
 
+@pytest.mark.long
 def test_the_moments_follow_the_points():
     def moments(parameters):
         return drive(parameters, CLOUDS, ANCHORS, 2048).moments

@@ -90,6 +90,7 @@ def drive(world, seconds, sets=(), *, inertial=True, moving_start=False, T_imu_l
     )
 
 
+@pytest.mark.long
 def test_inertial_samples_hold_a_fast_handheld_walk():
     near = [f"{path}={value}" for path, value in Default.near_values.items()]
     coupled, alone = drive("office", 12.0, near), drive("office", 12.0, near, inertial=False)

@@ -217,6 +217,7 @@ def test_a_runaway_bias_starts_the_smoother_anew():
         assert np.isfinite(float(output.log_evidence))
 
 
+@pytest.mark.long
 def test_information_in_place_of_fixed_sigmas():
     chosen = settings_with("config.lio_sam.lidar_noise=information")
     step = PerShape(jax.jit(LioSam(chosen.config).step))

@@ -105,6 +105,7 @@ def test_the_map_corrects_the_odometry(drive):
     assert np.linalg.norm(correction[-1, :3, 3] - correction[0, :3, 3]) > 1e-3
 
 
+@pytest.mark.long
 def test_mapping_every_third_scan_gives_a_pose_for_every_scan():
     config = replace(CONFIG, loam=replace(CONFIG.loam, mapping_every=3))
     _, outputs, poses = run(config=config)
@@ -114,6 +115,7 @@ def test_mapping_every_third_scan_gives_a_pose_for_every_scan():
     assert np.linalg.norm(np.diff(poses[MOVING:, :3, 3], axis=0), axis=1).min() > 0.01
 
 
+@pytest.mark.long
 def test_compensation_helps_a_moving_sensor(drive):
     without = run(config=replace(CONFIG, loam=replace(CONFIG.loam, compensate=False)))
     assert not np.array_equal(without[2], drive[2])
@@ -187,7 +189,8 @@ def test_without_any_corner_planes_alone_are_matched():
 
 
 @pytest.mark.parametrize(
-    ("sensor", "rings"), [("vlp8", 8), pytest.param("os1_128", 128, marks=pytest.mark.long)]
+    ("sensor", "rings"),
+    [pytest.param("vlp8", 8, marks=pytest.mark.long), pytest.param("os1_128", 128, marks=pytest.mark.long)],
 )
 def test_eight_and_128_beams(sensor, rings):
     if sensor == "vlp8":

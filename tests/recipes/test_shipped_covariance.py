@@ -54,6 +54,7 @@ def streets():
     ]
 
 
+@pytest.mark.long
 def test_errors_of_a_drive_that_begins_at_speed_are_as_large_as_default_says():
     pose, velocity = normalised([road("city", 10.0, 0.1, 60, seed) for seed in (3, 4)], "default")
     assert 0.25 < pose < 4
@@ -65,6 +66,7 @@ def sixteen_beams():
     return [SimulatedSequence("city", "vlp16", duration_s=12.0, imu=ImuModel(), seed=seed) for seed in (3, 4)]
 
 
+@pytest.mark.long
 def test_the_strips_that_few_beams_sweep_over_a_surface_leave_the_pose_as_good_as_its_covariance_says():
     pose, velocity = normalised(sixteen_beams(), "default")
     assert 0.25 < pose < 4

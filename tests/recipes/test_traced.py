@@ -50,6 +50,7 @@ def test_parameters_come_as_arrays_of_the_states_precision(path):
     assert not leaf.weak_type
 
 
+@pytest.mark.long
 def test_a_batch_of_parameters_equals_one_run_after_another():
     """Up to float32: batched sums and divisions are rounded otherwise, and a point may change its voxel."""
     scans = [scan(number) for number in range(5)]

@@ -156,7 +156,7 @@ def scans_of(name: str):
     return list(SimulatedSequence("city", "vlp16", 1.0).scans(4, 2)), 16, 2048
 
 
-@pytest.mark.parametrize("name", ["kitti", "city"])
+@pytest.mark.parametrize("name", ["kitti", pytest.param("city", marks=pytest.mark.long)])
 def test_recall_on_consecutive_scans(name):
     scans, rings, columns = scans_of(name)
     config = Config(features=LoamRingConfig(rings=rings, columns=columns))

@@ -11,7 +11,8 @@ from tests.shared_data import SHARED_DATA, needs_shared
 
 DRIVE = SHARED_DATA / "kitti_raw" / "2011_09_26" / "2011_09_26_drive_0015_sync"
 WITHOUT = ("config.imu.use=false",)
-CASES = [("default", ()), ("default", WITHOUT), ("fast_lio2", ()), ("lio_sam", ()), ("loam", ())]
+LONG = [pytest.param(name, (), marks=pytest.mark.long) for name in ("lio_sam", "loam")]
+CASES = [("default", ()), ("default", WITHOUT), ("fast_lio2", ()), *LONG]
 
 
 @needs_shared

@@ -17,7 +17,12 @@ from tests.run.roads import relative, road, steps, tracked
 from tests.run.small_drive import Replay
 
 BEFORE, AWAY, AFTER = 30, 100, 30
-RECIPES = ["default", "fast_lio2", "lio_sam", "loam"]
+RECIPES = [
+    "default",
+    "fast_lio2",
+    pytest.param("lio_sam", marks=pytest.mark.long),
+    pytest.param("loam", marks=pytest.mark.long),
+]
 
 
 @cache

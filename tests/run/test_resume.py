@@ -351,6 +351,7 @@ def in_a_process(scan, *words):
     )
 
 
+@pytest.mark.long
 def test_processes_that_are_killed_one_after_the_other(tmp_path):
     data, part = tmp_path / "data", inertial_drive.scans()
     T_imu_lidar = inertial_drive.drive().info.T_imu_lidar

@@ -125,7 +125,7 @@ def checked(
     return run.metrics["set_up"], run.metrics["verdict"]
 
 
-RECIPES = ["default", "fast_lio2", "lio_sam"]
+RECIPES = ["default", "fast_lio2", pytest.param("lio_sam", marks=pytest.mark.long)]
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
@@ -152,7 +152,13 @@ def test_a_wrong_translation_is_named_with_its_size():
 
 
 @pytest.mark.parametrize(
-    ("recipe", "late"), [("default", 0.05), ("default", -0.03), ("fast_lio2", 0.03), ("lio_sam", -0.05)]
+    ("recipe", "late"),
+    [
+        ("default", 0.05),
+        ("default", -0.03),
+        ("fast_lio2", 0.03),
+        pytest.param("lio_sam", -0.05, marks=pytest.mark.long),
+    ],
 )
 def test_another_clock_is_named_with_its_offset(recipe, late):
     (fault,), _ = checked(recipe, change=lambda imu: replace(imu, stamp_ns=imu.stamp_ns + round(late * 1e9)))
@@ -213,6 +219,7 @@ def test_few_beams_at_speed_are_named(beams, moved, named):
     assert faults_of(recipe_settings("loam"), beams=beams, moved=moved) == ["beams"] * named
 
 
+@pytest.mark.long
 def test_a_run_states_the_fault_in_its_folder(tmp_path, capsys):
     source, out = tmp_path / "drive", tmp_path / "run"
     command = ["sim", "city", "--sensor", "vlp16", "--duration", "12", "--seed", "3", "--out", str(source)]

@@ -46,7 +46,11 @@ def test_a_match_that_stays_at_rest_while_the_vehicle_drives_is_noticed():
 # default finds the speed of this drive from rest, and so does fast_lio2 where scan lines are no planes
 @pytest.mark.parametrize(
     ("recipe", "settings"),
-    [("fast_lio2", ["params.knn.least_width=0"]), ("lio_sam", []), ("loam", [])],
+    [
+        ("fast_lio2", ["params.knn.least_width=0"]),
+        pytest.param("lio_sam", [], marks=pytest.mark.long),
+        pytest.param("loam", [], marks=pytest.mark.long),
+    ],
 )
 def test_a_real_drive_that_is_taken_for_standing_is_lost(recipe, settings):
     sequence = open_sequence(DRIVE)
@@ -54,6 +58,7 @@ def test_a_real_drive_that_is_taken_for_standing_is_lost(recipe, settings):
     assert (found["state"], found["since_s"] < 0.3) == ("lost", True)
 
 
+@pytest.mark.long
 def test_an_error_of_more_than_five_percent_of_the_way_is_noticed():
     sequence = road("motorway", 5.0, 0.5, 12)
     settings, results = tracked(sequence, "loam", [AT_REST])
@@ -107,7 +112,12 @@ def test_unequal_stamps_of_equal_sweeps_are_no_jumps():
 
 @pytest.mark.parametrize(
     ("recipe", "looks", "is_doubted"),
-    [("loam", 2, True), ("loam", 1, False), ("loam", 0, False), ("default", 2, False)],
+    [
+        pytest.param("loam", 2, True, marks=pytest.mark.long),
+        pytest.param("loam", 1, False, marks=pytest.mark.long),
+        pytest.param("loam", 0, False, marks=pytest.mark.long),
+        ("default", 2, False),
+    ],
 )
 @pytest.mark.parametrize("stays", [False, True])
 def test_a_way_along_which_nothing_shows_the_motion_is_doubtful_without_inertial_samples(

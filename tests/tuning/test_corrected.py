@@ -134,7 +134,7 @@ def test_the_replayed_trajectory_is_that_of_the_back_end(fixes):
     ("objective", "fixes", "elevation"),
     [
         pytest.param("ate", False, True, marks=pytest.mark.long),
-        ("ate+rpe", True, True),
+        pytest.param("ate+rpe", True, True, marks=pytest.mark.long),
         pytest.param("ate", True, False, marks=pytest.mark.long),
     ],
     ids=["loops", "loops and fixes", "heights of the odometry"],

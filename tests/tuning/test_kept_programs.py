@@ -3,6 +3,7 @@
 from functools import cache
 
 import numpy as np
+import pytest
 
 from lio_jax.core.xla import forget_programs, programs
 from lio_jax.run.run import imu_feed
@@ -37,6 +38,7 @@ def other_drive() -> SimulatedSequence:
     return SimulatedSequence(duration_s=1.0, beams=16, columns=256, seed=4, imu=ImuModel())
 
 
+@pytest.mark.long
 def test_a_second_gradient_compiles_nothing():
     first = gradient(drive(), FREE, POSE, chosen(), count=COUNT)
     # simulating compiles, too
@@ -51,6 +53,7 @@ def test_a_second_gradient_compiles_nothing():
     assert len({first.value, values.value, recording.value}) == 3
 
 
+@pytest.mark.long
 def test_other_parameters_and_objectives_have_programs_of_their_own():
     gradient(drive(), FREE, POSE, chosen(), count=COUNT)
     with compilations() as compiled:
@@ -62,6 +65,7 @@ def test_other_parameters_and_objectives_have_programs_of_their_own():
     assert len(compiled) >= 4
 
 
+@pytest.mark.long
 def test_a_second_evaluation_of_a_tuning_compiles_nothing():
     free = free_parameters(chosen().params(), FREE)
     elsewhere = free_parameters(other_values().params(), FREE)
