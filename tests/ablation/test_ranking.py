@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_1samp, wilcoxon
 
-from lio_jax.ablation.ranking import holm, ranking
+from lio_jax.ablation.ranking import VariantComparison, holm, ranking
 from lio_jax.ablation.report import pareto_front
+from lio_jax.ablation.spec import load_spec
+from lio_jax.ablation.tasks import tasks_of
+from tests.ablation.drives import write_spec
 
 SEEDS = range(5)
 WORLDS = ("a", "b")
@@ -78,3 +81,14 @@ def test_holm_by_hand():
 def test_pareto_front():
     points = {"slow": (3.0, 1.0), "fast": (1.0, 3.0), "middle": (2.0, 2.0), "beaten": (2.5, 2.5)}
     assert pareto_front(points) == ["fast", "middle", "slow"]
+
+
+def test_recordings_without_truth_are_named(tmp_path):
+    spec = load_spec(write_spec(tmp_path / "spec.yaml"))
+    tasks, names = tasks_of(spec), [variant.name for variant in spec.variants]
+    values = {metric: {} for metric in spec.metrics}
+    rows = ranking(values, names, spec.baseline.name, len(spec.sources))
+    done = {task.key for task in tasks}
+    *_, row, sentence = str(VariantComparison(spec, tasks, done, values, rows, {})).splitlines()
+    assert "no value" in row
+    assert sentence.startswith("No run has a value of ate.rmse. Errors of the trajectory need the true one")

@@ -4,7 +4,7 @@ import json
 import numpy as np
 import pytest
 
-from lio_jax.core.errors import LioJaxError
+from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.data.trajectory import Trajectory, write_kitti_poses, write_tum
 from lio_jax.evaluation.evaluate import evaluate, evaluate_files, format_evaluation
 from tests.evaluation.scenes import EPOCH_NS, PERIOD_NS, stamped, straight_drive, transform, winding_drive
@@ -143,3 +143,8 @@ def test_table_of_a_single_pose_has_no_numbers_where_there_are_none():
     text = format_evaluation(evaluate(pose, pose))
     assert "too few poses" in text
     assert "note: Aligned by the first pose" in text
+
+
+def test_the_truth_of_a_recording_without_one_is_refused():
+    with pytest.raises(UsageError, match=r"no trajectory to compare with.* lio_jax\.read_tum"):
+        evaluate(straight_drive(), None)
