@@ -28,16 +28,21 @@ class Intervals(eqx.Module):
     """False where no sample is near the span: all rates and forces are then zero."""
 
     def without_bias(
-        self, gyro_bias: Float[Array, "3"], accel_bias: Float[Array, "3"]
+        self,
+        gyro_bias: Float[Array, "3"],
+        accel_bias: Float[Array, "3"],
+        unmeasured: tuple[Float[Array, "3"], Float[Array, "3"]] | None = None,
     ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
-        """Return angular rates (rad/s) and specific forces (m/s^2) without biases; zero where not measured.
+        """Return angular rates (rad/s) and specific forces (m/s^2) without biases.
 
         Args:
             gyro_bias: rad/s, IMU frame.
             accel_bias: m/s^2, IMU frame.
+            unmeasured: rate and force where nothing is measured; None: zero.
         """
-        rate = jnp.where(self.measured, self.gyro - gyro_bias, 0.0)
-        return rate, jnp.where(self.measured, self.accel - accel_bias, 0.0)
+        rate, force = (0.0, 0.0) if unmeasured is None else unmeasured
+        rates = jnp.where(self.measured, self.gyro - gyro_bias, rate)
+        return rates, jnp.where(self.measured, self.accel - accel_bias, force)
 
 
 def sample_intervals(
@@ -45,10 +50,10 @@ def sample_intervals(
 ) -> Intervals:
     """Cut the span from ``start`` to ``end`` at the samples; an interval has the mean of its two ends.
 
-    The signal is linear between samples and is interpolated at the span's ends. Before the first sample and
-    after the last one it is constant. A sample stamped t by the IMU was taken at t - time_offset on the
-    lidar's clock. Samples may be in any order. Those that are masked or not finite are left out. Without any
-    sample all rates and forces are zero and not measured.
+    A span in which there is no sample is cut evenly. The signal is linear between samples and is interpolated
+    at the span's ends. Before the first sample and after the last one it is constant. A sample stamped t by
+    the IMU was taken at t - time_offset on the lidar's clock. Samples may be in any order. Those that are
+    masked or not finite are left out. Without any sample all rates and forces are zero and not measured.
 
     Args:
         imu: m samples.
@@ -57,7 +62,7 @@ def sample_intervals(
         end: on the lidar's clock, s, not before ``start``.
 
     Returns:
-        m + 1 intervals; those outside the span have zero duration.
+        m + 1 intervals; those of samples outside the span have zero duration.
     """
     dtype = time_offset.dtype
     samples = jnp.concatenate([imu.time[:, None], imu.gyro, imu.accel], axis=1).astype(dtype)
@@ -83,10 +88,16 @@ def sample_intervals(
     values = jnp.where(early[:, None], at_start, jnp.where(late[:, None], at_end, signal))
     knots = jnp.concatenate([start[None], knots, end[None]])
     values = jnp.concatenate([at_start[None], values, at_end[None]])
-    duration = jnp.diff(knots)
-
     between = jnp.concatenate([jnp.zeros(1, bool), valid[1:] & valid[:-1], jnp.zeros(1, bool)])
-    gap = jnp.where(between, jnp.diff(time, prepend=start, append=end), duration)
+    gap = jnp.where(between, jnp.diff(time, prepend=start, append=end), jnp.diff(knots))
+    # A span between two samples is cut into many intervals: an error that is constant over all of it would
+    # tie the last pose to the mean of the sweep, and errors of the poses would swing forever.
+    empty = ~jnp.any(valid & ~early & ~late)
+    share = jnp.linspace(0, 1, len(knots), dtype=dtype)[:, None]
+    knots = jnp.where(empty, start + share[:, 0] * (end - start), knots)
+    values = jnp.where(empty, at_start + share * (at_end - at_start), values)
+    gap = jnp.where(empty, jnp.max(jnp.where(knots[1:] > knots[:-1], gap, 0.0)), gap)
+    duration = jnp.diff(knots)
     near = (time > start - LONGEST_GAP) | (time[last] >= end)
     near &= (time < end + LONGEST_GAP) | (time[0] <= start)
     any_near = jnp.any(valid & near)

@@ -132,12 +132,13 @@ def propagate_sweep(
     start: Float[Array, ""],
     end: Float[Array, ""],
     sweep_start: Float[Array, ""],
+    rate: Float[Array, "3"] | None = None,
 ) -> tuple[SweptState, Path]:
     """Propagate a state and its covariance from ``start`` to ``end`` along the inertial samples.
 
     :func:`lio_jax.imu.sampling.sample_intervals` makes intervals of the samples. Where no sample is near the
-    span, the velocity stays constant and the rate is zero. There, and in long gaps between samples, the noise
-    is that of an unknown motion (:mod:`lio_jax.imu.discretise`).
+    span, the rate and the velocity in the body's own axes stay constant. There, and in long gaps between
+    samples, the noise is that of an unknown motion (:mod:`lio_jax.imu.discretise`).
 
     Args:
         state: at ``start``.
@@ -146,6 +147,7 @@ def propagate_sweep(
         start: usually the previous scan's end, s from this scan's start.
         end: s from this scan's start, not before ``start``.
         sweep_start: time of the sweep's first point, s from this scan's start. The last point is at ``end``.
+        rate: angular rate where nothing is measured, rad/s, IMU frame; None: zero.
 
     Returns:
         The state at ``end``, with the covariance of its error and of the error's difference from its mean
@@ -153,7 +155,8 @@ def propagate_sweep(
     """
     nav = state.nav
     intervals, shift = _intervals_and_shift(imu, nav.time_offset, start, end)
-    increments, path = _follow(nav, intervals, start)
+    unmeasured = _carried_on(nav, rate)
+    increments, path = _follow(nav, intervals, start, unmeasured)
     last = jaxlie.SE3(path.T_world_imu.wxyz_xyz[-1])
     moved = dataclasses.replace(nav, T_world_imu=last, velocity=path.velocity[-1])
 
@@ -162,7 +165,7 @@ def propagate_sweep(
     times = start, end, sweep_start
     held = jax.lax.stop_gradient(model)
     known = _effects_of(*jax.lax.stop_gradient((motion, params, *times)))
-    effects = with_derivative_of(known, _linear_effects, model, held, imu, times)
+    effects = with_derivative_of(known, _linear_effects, model, held, imu, times, unmeasured)
 
     shown = still_to_show(start, sweep_start, end)
     transition = _transition(nav, increments, path.gravity, effects.by_bias, effects.by_offset, shown)
@@ -224,7 +227,9 @@ def _effects_of(
     )
 
 
-def _linear_effects(model: _ImuModel, held: _ImuModel, imu: ImuBatch, times: tuple) -> _Effects:
+def _linear_effects(
+    model: _ImuModel, held: _ImuModel, imu: ImuBatch, times: tuple, unmeasured: tuple[Array, Array]
+) -> _Effects:
     """Return the effects as a linear function of the model around the same values.
 
     The slope by each of its few numbers is worked out once, so the cost grows little with the number of
@@ -235,7 +240,7 @@ def _linear_effects(model: _ImuModel, held: _ImuModel, imu: ImuBatch, times: tup
     def effects(x: Array) -> _Effects:
         gyro_bias, accel_bias, time_offset, noise = numbers(x)
         intervals, shift = _intervals_and_shift(imu, time_offset, *times[:2])
-        rate, accel = intervals.without_bias(gyro_bias, accel_bias)
+        rate, accel = intervals.without_bias(gyro_bias, accel_bias, unmeasured)
         increments = accumulate(intervals.duration, rate, accel)
         return _effects_of(_SampledMotion(intervals, shift, rate, accel, increments), noise, *times)
 
@@ -264,12 +269,24 @@ def path_along(nav: NavState, imu: ImuBatch, start: Float[Array, ""], end: Float
         start: on the lidar's clock, s, from the same origin as the samples' times.
         end: on the lidar's clock, s, not before ``start``.
     """
-    return _follow(nav, sample_intervals(imu, nav.time_offset, start, end), start)[1]
+    intervals = sample_intervals(imu, nav.time_offset, start, end)
+    return _follow(nav, intervals, start, _carried_on(nav, None))[1]
 
 
-def _follow(nav: NavState, intervals: Intervals, start: Float[Array, ""]) -> tuple[Increments, Path]:
-    rate, accel = intervals.without_bias(nav.gyro_bias, nav.accel_bias)
-    # constant velocity where nothing is measured, so gravity must have no effect either
+def _carried_on(nav: NavState, rate: Float[Array, "3"] | None) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Return rate and weightless force of a body whose rate and velocity in its own axes stay constant."""
+    rate = jnp.zeros_like(nav.velocity) if rate is None else rate
+    return rate, jnp.cross(rate, rotation_matrix(nav.T_world_imu.rotation()).T @ nav.velocity)
+
+
+def _follow(
+    nav: NavState,
+    intervals: Intervals,
+    start: Float[Array, ""],
+    unmeasured: tuple[Float[Array, "3"], Float[Array, "3"]],
+) -> tuple[Increments, Path]:
+    rate, accel = intervals.without_bias(nav.gyro_bias, nav.accel_bias, unmeasured)
+    # nothing measures the weight there, so gravity must have no effect either
     gravity = jnp.where(intervals.measured, nav.gravity, 0.0)
     increments = accumulate(intervals.duration, rate, accel)
     rotation = nav.T_world_imu.rotation()

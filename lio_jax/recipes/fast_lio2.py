@@ -238,9 +238,10 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
                 last = NavEstimate(opened, state.uncertain.covariance)
                 prior, path = predicted_without_samples(params, last, rate, scan, first)
             else:
-                to_end, rate = jnp.zeros_like(state.to_end), state.rate
+                to_end = jnp.zeros_like(state.to_end)
+                rate = state.rate * Outage.turning(params, state.unmatched, scan)
                 # as FAST-LIO2 does, the match is taken for one of the pose at the scan's end
-                prior, path = predicted(params, state.uncertain, scan, imu, first, sweep_start=scan.duration)
+                prior, path = predicted(params, state.uncertain, scan, imu, first, scan.duration, rate)
             T_predicted = lidar_pose(prior.nav)
         with jax.named_scope("thin"):
             points, time, in_range = _filtered(config.fast_lio2.point_filter_num, params, scan)

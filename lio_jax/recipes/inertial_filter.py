@@ -85,6 +85,7 @@ def predicted(
     imu: ImuBatch,
     first: Bool[Array, ""],
     sweep_start: Float[Array, ""] | float = 0.0,
+    rate: Float[Array, "3"] | None = None,
 ) -> tuple[SweptState, Path]:
     """Return the state at the scan's end and the motion since the last scan's end.
 
@@ -95,12 +96,13 @@ def predicted(
         imu: samples around the time since then.
         first: no scan was seen before.
         sweep_start: time of the scan's first point, s.
+        rate: angular rate where nothing is measured, rad/s, IMU frame; None: zero.
     """
     dtype = last.covariance.dtype
     end = scan.duration.astype(dtype)
     start = jnp.where(first, 0.0, end - scan.interval.astype(dtype))
     sweep_start = jnp.asarray(sweep_start, dtype)
-    moved, path = propagate_sweep(last, imu, params.imu, start, end, sweep_start)
+    moved, path = propagate_sweep(last, imu, params.imu, start, end, sweep_start, rate)
     # the first scan's end is the world's origin: its samples only deskew it
     opened = _held_at_mean(last, jnp.where(jnp.any(scan.mask), end - sweep_start, 0.0))
     return jax.tree.map(lambda new, old: jnp.where(first, old, new), moved, SweptState.at_once(opened)), path

@@ -19,6 +19,7 @@ from lio_jax.lidar.thinning import ThinnedScan, thinned
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.voxel_map import VoxelMap, empty_map, following, insert
 from lio_jax.recipes import recipe
+from lio_jax.recipes.constant_velocity import mean_rate
 from lio_jax.recipes.default_params import DefaultConfig, DefaultParams
 from lio_jax.recipes.inertial_filter import (
     after_match,
@@ -48,6 +49,8 @@ class InertialState(recipe.State):
     """Expected error of the next prediction, m; the robust kernel is wide enough for it."""
     scans: Int32[Array, ""]
     """Number of scans with points so far."""
+    rate: Float[Array, "3"]
+    """Mean angular rate between the last two scans' ends, rad/s, IMU frame."""
     unmatched: Float[Array, ""]
     """Time since the last scan that was matched, s."""
     map: VoxelMap
@@ -82,6 +85,7 @@ def init(config: DefaultConfig, params: DefaultParams, imu: ImuBatch) -> Inertia
         drift=MapDrift.none(dtype),
         prediction_error=jnp.asarray(params.motion.initial_error, dtype),
         scans=jnp.int32(0),
+        rate=jnp.zeros_like(start.nav.velocity),
         unmatched=jnp.zeros((), dtype),
         map=empty_map(config.map.capacity),
     )
@@ -104,7 +108,8 @@ def step(
     sizes = config.imu.insertion_points, config.imu.registration_points
     thin = thinned(params.lidar, scan, params.map.point_spacing, spacing, *sizes)
     with jax.named_scope("predict"):
-        prior, path = predicted(params, state.estimate, scan, imu, first)
+        rate = state.rate * Outage.turning(params, state.unmatched, scan)
+        prior, path = predicted(params, state.estimate, scan, imu, first, rate=rate)
         T_predicted = lidar_pose(prior.nav)
         still = jax.lax.stop_gradient((path, prior.nav.T_imu_lidar, thin.points))
         points = deskew_along(*still, thin.time)
@@ -161,6 +166,7 @@ def step(
             )
         ),
         scans=state.scans + jnp.any(thin.mask).astype(jnp.int32),
+        rate=jnp.where(first | lost, rate, mean_rate(state.nav, posterior.nav, scan)),
         unmatched=outage.after((first & ~jnp.any(thin.mask)) | (lost & ~new_piece)),
         map=vmap,
     )

@@ -252,3 +252,11 @@ def _stamps(start: int, end: int) -> list[int]:
 
 def test_the_drive_is_sampled_as_the_tests_think() -> None:
     assert np.all(np.diff(imu().stamp_ns) == round(1e9 / RATE))
+
+
+def test_samples_that_end_in_a_bend_do_not_end_the_estimate(replayed: Replayer) -> None:
+    """For five seconds constant rate and velocity predict the motion."""
+    seen = replayed(scans(30, 85), only(seconds() < 3.5))
+    assert seen.failures == {}
+    # with a rate of zero, or an error that is constant over each sweep, it is five times as large
+    assert seen.errors.max() < 2 * replayed(scans(30, 85), imu()).errors.max()
