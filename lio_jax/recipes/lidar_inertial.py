@@ -65,8 +65,8 @@ class InertialState(recipe.State):
         return self.map.varying()
 
     def with_velocity_of(self, found: "InertialState") -> "InertialState":
-        """Return this first state with the velocity of a later one."""
-        return eqx.tree_at(lambda state: state.nav.velocity, self, found.nav.velocity)
+        """Return this first state with the velocity and the rate of a later one."""
+        return eqx.tree_at(lambda one: (one.nav.velocity, one.rate), self, (found.nav.velocity, found.rate))
 
 
 def init(config: DefaultConfig, params: DefaultParams, imu: ImuBatch) -> InertialState:
