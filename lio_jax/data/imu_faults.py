@@ -52,13 +52,9 @@ def unmeasured(imu: ImuData, seconds: NDArray[np.float64]) -> tuple[NDArray[np.b
                 "dropped."
             )
             bad |= spiked
-        for axis, part in _stuck(values, max(_STUCK_SAMPLES, round(_STUCK_S / interval))):
-            end = "the end" if part.stop == len(seconds) else f"{seconds[part.stop]:.3f} s"
-            sentences.append(
-                f"the {name}'s {'xyz'[axis]} axis is stuck at {values[part.start, axis]:.4g} {unit} from "
-                f"{seconds[part.start]:.3f} s to {end} while the others move: these {part.stop - part.start} "
-                "samples were dropped."
-            )
+        held = list(_stuck(values, max(_STUCK_SAMPLES, round(_STUCK_S / interval))))
+        sentences += _on_stuck(held, values, seconds, name, unit)
+        for _, part, _ in held:
             bad[part] = True
     again = _sent_again(imu) & ~bad
     if again.any():
@@ -67,6 +63,38 @@ def unmeasured(imu: ImuData, seconds: NDArray[np.float64]) -> tuple[NDArray[np.b
             f"{seconds[int(np.argmax(again))]:.3f} s: they were dropped."
         )
     return bad | again, sentences
+
+
+def _on_stuck(
+    held: list[tuple[int, slice, bool]],
+    values: NDArray[np.float64],
+    seconds: NDArray[np.float64],
+    name: str,
+    unit: str,
+) -> list[str]:
+    """Return a sentence for each time in which an axis is stuck, and for each axis that is saturated."""
+    sentences = []
+    for axis, part, saturated in held:
+        if saturated:
+            continue
+        end = "the end" if part.stop == len(seconds) else f"{seconds[part.stop]:.3f} s"
+        sentences.append(
+            f"the {name}'s {'xyz'[axis]} axis is stuck at {values[part.start, axis]:.4g} {unit} from "
+            f"{seconds[part.start]:.3f} s to {end} while the others move: these {part.stop - part.start} "
+            "samples were dropped."
+        )
+    for axis in range(3):
+        parts = [part for one, part, saturated in held if saturated and one == axis]
+        if not parts:
+            continue
+        limits = sorted({float(values[part.start, axis]) for part in parts})
+        sentences.append(
+            f"the {name}'s {'xyz'[axis]} axis stays at {' and '.join(f'{one:.4g}' for one in limits)} {unit} "
+            f"for {sum(part.stop - part.start for part in parts)} samples, the first at "
+            f"{seconds[parts[0].start]:.3f} s: it is saturated, and these samples were dropped; use a larger "
+            "measuring range."
+        )
+    return sentences
 
 
 def _neighbours_median(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -97,10 +125,10 @@ def _spikes(off: NDArray[np.float64], least: float) -> NDArray[np.bool_]:
     return spiked if spiked.mean() <= _MOST_SPIKES else np.zeros(len(off), bool)
 
 
-def _stuck(values: NDArray[np.float64], least: int) -> Iterator[tuple[int, slice]]:
+def _stuck(values: NDArray[np.float64], least: int) -> Iterator[tuple[int, slice, bool]]:
     """Yield axis and samples of each time in which one axis keeps its value while the others change.
 
-    An axis that keeps its value at the end of its range is saturated, which is another fault.
+    The flag says whether the value is the end of the axis's range: the axis is saturated.
 
     Args:
         values: (m, 3).
@@ -124,14 +152,14 @@ def _stuck(values: NDArray[np.float64], least: int) -> Iterator[tuple[int, slice
             value = values[part.start, axis]
             saturated = value in ends and abs(value) > max(np.abs(ends)) / 2 and bool(elsewhere.any())
             still = equal[part.start : part.stop - 1][:, others].mean(axis=0) > _EQUAL_SHARE
-            if not saturated and not still.any() and all(_is_noisy(values[part, other]) for other in others):
-                yield axis, part
+            if not still.any() and all(_is_noisy(values[part, other]) for other in others):
+                yield axis, part, saturated
 
 
 def _is_noisy(values: NDArray[np.float64]) -> bool:
     """Return whether values scatter as a sensor's do: those of a noise-free simulator change smoothly."""
-    change = np.diff(values)
-    return float(np.mean(np.diff(change) ** 2)) > float(np.mean(change**2))
+    bend = np.diff(values, 2)
+    return float(np.sum(bend[1:] * bend[:-1])) < 0
 
 
 def _sent_again(imu: ImuData) -> NDArray[np.bool_]:

@@ -66,6 +66,8 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
         "params.map.corner_voxel_size": 0.1,
         "params.features.surface_spacing": 0.2,
     }
+    # it carries the velocity on, but not the rate
+    longest_bridged_gap = 5.0
     given_values: ClassVar[Mapping[str, Any]] = {
         "config.backend.gps_elevation": False,
         "params.gps.pose_variance": 25.0,

@@ -208,6 +208,9 @@ class Recipe(ABC, Generic[C, P, S]):
     has one set of values for all surroundings."""
     noise_from_recording: ClassVar[bool] = False
     """Whether the white noise of the inertial sensor is taken from each recording, where it is not given."""
+    longest_bridged_gap: ClassVar[float] = 0.0
+    """Longest gap between inertial samples, s, that the line between its ends bridges. In a longer one the
+    recipe is without samples. A recipe that carries rate and velocity on by itself does better without."""
     given_values: ClassVar[Mapping[str, Any]] = {}
     """Values by path in which the recipe differs from the defaults of the back end and of the runner."""
 

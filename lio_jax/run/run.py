@@ -14,7 +14,9 @@ from lio_jax.data.detect import without_effect
 from lio_jax.data.imu_checks import cleaned
 from lio_jax.data.sequence import ImuData, LidarScan, Sequence
 from lio_jax.imu.params import OrientedImuConfig
+from lio_jax.recipes import recipe_named
 from lio_jax.recipes.params import InertialConfig
+from lio_jax.run.clock_jumps import without_clock_jumps
 from lio_jax.run.fitted_settings import (
     fitted_to_surroundings,
     notes_on_rings,
@@ -197,8 +199,9 @@ def imu_feed(sequence: Sequence, settings: Settings) -> tuple[ImuFeed | None, tu
     recorded = sequence.imu()
     if recorded is None or not len(recorded.stamp_ns):
         return None, ()
+    recorded, jumps = without_clock_jumps(sequence, settings, recorded)
     imu, found = cleaned(recorded, "IMU", sequence.info.T_imu_lidar)
-    return feed_of(imu, settings), found
+    return feed_of(imu, settings), jumps + found
 
 
 def feed_of(imu: ImuData | None, settings: Settings) -> ImuFeed:
@@ -214,7 +217,8 @@ def feed_of(imu: ImuData | None, settings: Settings) -> ImuFeed:
     margin = OFFSET_MARGIN_S if estimated else 0.0
     offset = settings.values["extrinsics"]["time_offset"]
     own = isinstance(config.imu, OrientedImuConfig) and config.imu.orientation
-    return ImuFeed(imu, config.imu.buckets, offset, margin, own)
+    bridge = recipe_named(settings.recipe).longest_bridged_gap
+    return ImuFeed(imu, config.imu.buckets, offset, margin, own, bridge)
 
 
 def _described(sequence: Sequence) -> dict[str, Any]:

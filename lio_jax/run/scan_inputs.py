@@ -61,11 +61,8 @@ def _extended(values: np.ndarray, size: int, dtype: type) -> np.ndarray:
 OFFSET_MARGIN_S = 0.05
 """Largest change of an estimated time offset from its first value for which samples are available, s."""
 
-_NEAR_S = 0.5
+_NEAR_S = 0.2
 """A neighbouring sample farther than this from a scan's interval does not describe the motion in it, s."""
-_BRIDGE_S = 5.0
-"""Longest gap between two samples, s, in which the line between them tells of the motion. It is uncertain,
-but in a turn it is far better than none."""
 
 
 class ImuFeed:
@@ -78,6 +75,7 @@ class ImuFeed:
         time_offset: float = 0.0,
         margin_s: float = OFFSET_MARGIN_S,
         orientation: bool = False,
+        bridge_s: float = 0.0,
     ) -> None:
         """Store the recording's samples.
 
@@ -88,6 +86,7 @@ class ImuFeed:
             margin_s: largest change of an estimated offset from ``time_offset``, s; 0 if the offset is
                 frozen.
             orientation: whether to pass on the IMU's own orientations, where it reports them.
+            bridge_s: longest gap, s, in which the line between its ends stands for the samples.
         """
         count = 0 if imu is None else len(imu.stamp_ns)
         self._imu = imu if count else None
@@ -101,6 +100,7 @@ class ImuFeed:
         self._buckets = buckets
         self._offset_ns = round(time_offset * 1e9)
         self._margin_ns = round(margin_s * 1e9)
+        self._bridge_ns = round(bridge_s * 1e9)
         self._span: tuple[int, int] | None = None
         self._scans = self._without = self._thinned = 0
 
@@ -194,7 +194,7 @@ class ImuFeed:
         """Return whether the gap between a sample and the next one is short enough for a line."""
         if not 0 <= index < len(self._stamps) - 1:
             return False
-        return bool(self._stamps[index + 1] - self._stamps[index] <= round(_BRIDGE_S * 1e9))
+        return bool(self._stamps[index + 1] - self._stamps[index] <= self._bridge_ns)
 
     def _padded(self, first: int, last: int, origin_ns: int) -> ImuBatch:
         count = last - first

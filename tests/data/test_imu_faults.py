@@ -103,6 +103,19 @@ def test_a_block_that_is_sent_again_is_dropped():
     )
 
 
+def test_samples_of_an_axis_at_the_end_of_a_small_range_are_dropped():
+    """A gyroscope of 0.3 rad/s; the vehicle turns at up to 0.4 rad/s."""
+    imu = drive()
+    clipped = np.clip(imu.gyro, -0.3, 0.3)
+    result, said = cleaned(replaced(imu, gyro=clipped), "/imu")
+    (sentence,) = (one for one in said if "dropped" in one)
+    assert "the gyroscope's z axis stays at 0.3 rad/s for" in sentence
+    lost = np.isin(imu.stamp_ns, result.stamp_ns, invert=True)
+    assert (np.abs(clipped[lost, 2]) == 0.3).all()
+    # where the rate is near the limit, noise breaks the time up into parts that are kept
+    assert lost.sum() > 0.7 * np.count_nonzero(np.abs(clipped[:, 2]) == 0.3)
+
+
 def test_values_that_are_held_are_no_block():
     """Samples of 100 Hz that a driver repeats at 200 Hz."""
     imu = drive()

@@ -179,6 +179,15 @@ def test_saturation_is_said(replayed: Replayer) -> None:
     assert seen.errors.max() < 0.05
 
 
+def test_a_gyroscope_of_too_small_a_range_is_survived(replayed: Replayer) -> None:
+    """In a bend of 0.5 rad/s."""
+    fastest = np.abs(imu().gyro[:, 2]).max()
+    seen = replayed(scans(30, 75), changed(gyro=imu().gyro.clip(-0.6 * fastest, 0.6 * fastest)))
+    assert any("saturated" in one for one in seen.warnings)
+    assert seen.failures == {}
+    assert seen.errors.max() < 2 * replayed(scans(30, 75), imu()).errors.max()
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("name", ["gyro", "accel"])
 def test_samples_that_are_not_finite_are_left_out(replayed: Replayer, name: str, value: float) -> None:
