@@ -1,5 +1,6 @@
 """Choose the parts of a recording to examine: all of a short one, windows of consecutive scans of others."""
 
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -47,8 +48,11 @@ class Sampled:
 
     def windows(self) -> Iterator[ScanWindow]:
         """Yield the windows; each one is decoded when it is asked for."""
-        for part in self._parts:
-            yield ScanWindow(0, False, _first(part, WINDOW_SCANS))
+        for part in self._parts[:-1]:
+            yield ScanWindow(0, False, list(part.scans(0, WINDOW_SCANS)))
+        for part in self._parts[-1:]:
+            # the last scan shows how long the recording is
+            yield ScanWindow(0, False, list(deque(part.scans(), WINDOW_SCANS)))
         for first, count in self._places:
             yield ScanWindow(first, True, list(self.sequence.scans(first, count)))
 
@@ -107,7 +111,3 @@ def _shares(imu: ImuData | None) -> list[float]:
     busy: NDArray[np.float64] = np.array([np.nanpercentile(piece, 75) for piece in pieces[1:-1]])
     chosen = (1 + np.argsort(busy)[::-1][: _WINDOWS - 2]) / _CANDIDATES
     return sorted([0.0, *chosen.tolist(), 1.0])
-
-
-def _first(part: RosbagSequence, count: int) -> list[LidarScan]:
-    return list(part.scans(0, count))
