@@ -27,6 +27,8 @@ MOST_BYTES = 2 << 30
 """Memory that a command may take beyond what its process held before, bytes."""
 SILENCE_S = 20.0
 """Computing time after which a command that has printed nothing further counts as hanging, s."""
+COMPILING_SILENCE_S = 80.0
+"""The same for a command that first compiles its programs, on one core, s."""
 _LONGEST_WAIT_S = 120.0
 """Time after which it counts as hanging even if it computed less, s: a busy machine gives it a share only."""
 _LOOK_S = 0.02
@@ -251,7 +253,7 @@ class Trial:
             except Exception:
                 continue
         filled = [word.replace("{in}", str(folder)).replace("{out}", str(results)) for word in words]
-        done = self.worker.run(filled, results)
+        done = self.worker.run(filled, results, COMPILING_SILENCE_S if kind.compiles else SILENCE_S)
         verdict = judge(done, folder, results, MOST_BYTES, kind.ends, kind.may_be_nan)
         if keep is not None:
             shutil.rmtree(keep, ignore_errors=True)

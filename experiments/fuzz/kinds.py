@@ -43,6 +43,8 @@ class Kind:
     """Names of results in which a value that is not finite is right."""
     every: int = 1
     """The kind takes part in every so manieth round: its commands take longer than others."""
+    compiles: bool = False
+    """Whether its commands compile programs of their own before they print anything."""
 
     def words(self, edits: list[Edit], random: Random) -> tuple[str, ...]:
         """Return the words of a command that reads a damaged file, where only some commands read it."""
@@ -105,6 +107,7 @@ KINDS = (
         (mutations.tree,),
         ((*_RUN, "--recipe", "{in}/my.yaml"),),
         every=50,
+        compiles=True,
     ),
     Kind(
         "rest",

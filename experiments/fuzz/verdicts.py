@@ -24,6 +24,8 @@ FAILURES = (
 _LONGEST = 1200
 _EXCEPTION = re.compile(r"\b[A-Z]\w*(Error|Exception|Warning|Exit)\b|object at 0x|unexpected [A-Z]\w+:")
 _NOT_FINITE = re.compile(r"(?<![\w.])[-+]?(nan|inf|infinity)(?![\w.])", re.IGNORECASE)
+_SENTENCES_NUMBER = re.compile(r"NaN or infinity|\((nan|inf)[^)]*\)", re.IGNORECASE)
+"""What a sentence may say of values that were left out."""
 _TEXTS = dict.fromkeys((".tum", ".txt", ".g2o"), _NOT_FINITE) | {".yaml": re.compile(r"\.(nan|inf)\b")}
 """What is not finite, by the ending of a result."""
 
@@ -94,8 +96,7 @@ def judge(
         if str(folder) not in last and str(results) not in last:
             return Verdict("unclear", last)
         return Verdict(REFUSED, last)
-    # a sentence may speak of what it left out
-    if _NOT_FINITE.search(done.out.replace("NaN or infinity", "")):
+    if _prints_not_finite(done.out):
         return Verdict("not finite", "in the printed result")
     for path in sorted(results.rglob("*")):
         if found := _not_finite(path, may_be_nan):
@@ -107,6 +108,16 @@ def _spoken(line: str) -> bool:
     """Return whether a line of standard error is of a form that the commands have."""
     known = ("note: ", "warning: ", "lio-jax: ", "  ", "not taken:", "failed: ")
     return not line or line.startswith(known) or "'s parameters, recipe " in line or " runs" in line
+
+
+def _prints_not_finite(out: str) -> bool:
+    """Return whether a printed result holds a number that is not finite; a sentence may speak of one."""
+    constants: list[str] = []
+    try:
+        json.loads(out, parse_constant=constants.append)
+    except ValueError:
+        return bool(_NOT_FINITE.search(_SENTENCES_NUMBER.sub("", out)))
+    return bool(constants)
 
 
 def _not_finite(path: Path, may_be_nan: tuple[str, ...]) -> str:

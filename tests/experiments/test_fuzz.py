@@ -51,6 +51,11 @@ def test_judge(tmp_path):
     assert verdict_on(tmp_path, grown=1001) == "memory"
     assert verdict_on(tmp_path, outside=("open /etc/passwd",)) == "outside"
     assert verdict_on(tmp_path, out="ATE nan m\n") == "not finite"
+    assert verdict_on(tmp_path, out='{"duration": Infinity}') == "not finite"
+    assert (
+        verdict_on(tmp_path, out='{"problems": ["scan 2: its duration (inf s) is impossible."]}') == ACCEPTED
+    )
+    assert verdict_on(tmp_path, out="scan 2: its duration (inf s) is impossible.\n") == ACCEPTED
     assert verdict_on(tmp_path, "is empty", status=1, err=refusal) == ACCEPTED
 
 
