@@ -74,7 +74,9 @@ class PointTiming:
         middle = float(np.median(time.astype(np.float64)))
         if not abs(middle) * self.tick_ns < FARTHEST_NS:
             return np.ones(time.shape, bool)
-        wrong: NDArray[np.bool_] = np.abs(time.astype(np.float64) - middle) > 0.75 * longest
+        ticks = time.astype(np.float64)
+        beyond = ~(np.abs(ticks) * self.tick_ns < FARTHEST_NS)
+        wrong: NDArray[np.bool_] = (np.abs(ticks - middle) > 0.75 * longest) | beyond
         return wrong
 
     def can_be_scan(self, low: float | int, high: float | int) -> bool:

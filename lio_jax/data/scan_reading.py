@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.timestamps import ns_to_seconds
+from lio_jax.core.timestamps import FARTHEST_NS, ns_to_seconds
 from lio_jax.data.cloud_fields import RawCloud
 from lio_jax.data.config import DataConfig
 from lio_jax.data.point_time import PointTiming, TimeSample, recognise_point_time, scan_period, stamp_end
@@ -68,7 +68,12 @@ class ScanReading:
             if not time.size:
                 return cloud.stamp_ns, time.astype(np.float32), self.sweep, keep
             low, high = time.min().item(), time.max().item()
-        return *self.timing.place(cloud.stamp_ns, time, low, high), keep
+        start_ns, seconds, duration = self.timing.place(cloud.stamp_ns, time, low, high)
+        if not abs(start_ns) < FARTHEST_NS:
+            warn(f"{name}: {len(time)} points with impossible times were dropped.")
+            nothing = np.zeros(0, np.float32)
+            return cloud.stamp_ns, nothing, self.sweep, np.zeros(len(cloud.points), bool)
+        return start_ns, seconds, duration, keep
 
 
 def recognise_clouds(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from lio_jax.core.errors import LioJaxError
+from lio_jax.core.timestamps import FARTHEST_NS
 from tests.data import bags
 from tests.data.cloud_files import packed, pcd_bytes, ply_bytes
 from tests.data.test_clouds import BARE, CLOUD, POINTS, SEEN, folder, npy_bytes, opened
@@ -40,6 +41,20 @@ def test_a_scan_whose_times_are_impossible_has_no_points(tmp_path, wrong):
     assert [len(scan.points) for scan in scans] == [POINTS, POINTS, 0, POINTS]
     assert [scan.stamp_ns for scan in scans] == [int(name[:-4]) for name in NAMES]
     assert f"{POINTS} points with impossible times were dropped" in " ".join(sequence.warnings_so_far)
+
+
+@pytest.mark.parametrize("wrong", [-5e23, 5e23])
+def test_one_impossible_time_in_the_first_scan_leaves_possible_stamps(tmp_path, wrong):
+    """The spread of the first scans, by which times are recognised, is then impossible too."""
+    path = folder(tmp_path, NAMES[:1], pcd_bytes(with_field("time", SEEN.time)))
+    times = SEEN.time.copy()
+    times[3] = wrong
+    (path / NAMES[0]).write_bytes(pcd_bytes(with_field("time", times)))
+    sequence = opened(path)
+    (scan,) = sequence.scans()
+    assert abs(scan.stamp_ns) < FARTHEST_NS
+    assert np.isfinite(scan.time).all()
+    assert "points with impossible times were dropped" in " ".join(sequence.warnings_so_far)
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
