@@ -7,6 +7,7 @@ back depends on the outputs of the scans before alone, so that a resumed run rep
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -92,11 +93,11 @@ class KeyframePager:
 
     def _page(self, stored: _Stored) -> Page:
         corners, surfaces = self._room
-        padded: list[Any] = []
+        padded: list[jax.Array] = []
         for points, room in ((stored.corner, corners), (stored.surface, surfaces)):
             rows = np.zeros((room, 3), np.float32)
             rows[: len(points)] = points
-            padded += [rows, np.arange(room) < len(points)]
+            padded += [jnp.asarray(rows), jnp.arange(room) < len(points)]
         return Page(
             number=jnp.int32(stored.number),
             T_world_lidar=jaxlie.SE3(jnp.asarray(stored.wxyz_xyz)),
