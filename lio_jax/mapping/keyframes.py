@@ -46,8 +46,25 @@ class Keyframes(eqx.Module):
     """Number of real corners of each keyframe."""
     surfaces: Int32[Array, " k"]
     """Number of real surface points of each keyframe."""
+    number: Int32[Array, " k"]
+    """Running number of each keyframe, from 0; -1 in a free row."""
     last: Int32[Array, ""]
     """Row of the latest keyframe; -1 before the first one."""
+    count: Int32[Array, ""]
+    """Number of keyframes so far, those without a row included."""
+
+
+class Page(eqx.Module):
+    """A keyframe that has lost its row and comes back."""
+
+    number: Int32[Array, ""]
+    """Its running number."""
+    T_world_lidar: jaxlie.SE3
+    """Its pose, m."""
+    time: Float[Array, ""]
+    """Its time, s, on the keyframes' clock."""
+    cloud: KeyframeCloud
+    """Its points."""
 
 
 def no_keyframes(capacity: int, corners: int, surfaces: int, dtype: jnp.dtype) -> Keyframes:
@@ -70,7 +87,9 @@ def no_keyframes(capacity: int, corners: int, surfaces: int, dtype: jnp.dtype) -
         surface=jnp.zeros((capacity, surfaces, 3), jnp.float32),
         corners=none,
         surfaces=none,
+        number=none - 1,
         last=jnp.int32(-1),
+        count=jnp.int32(0),
     )
 
 
@@ -100,7 +119,7 @@ def with_keyframe(
     """Return the keyframes with one more, which counts as entered into the map.
 
     The new keyframe takes a free row. If there is none, it replaces the oldest keyframe that is neither
-    sparse nor recent, and if there is none of these, the oldest keyframe.
+    sparse nor recent, and if there is none of these, the keyframe that is farthest away.
 
     Args:
         keyframes: all so far; donate them.
@@ -111,11 +130,10 @@ def with_keyframe(
         params: ``spacing`` (m) of sparse keyframes, and the age ``recent`` (s).
     """
     capacity = len(keyframes.time)
-    free = jnp.isinf(keyframes.time)
-    alone = ~jnp.any(keyframes.sparse & ~free & (_distance(keyframes, T_world_lidar) < params.spacing))
-    spent = ~keyframes.sparse & (keyframes.time < time - params.recent)
-    since = jnp.where(free, -jnp.inf, keyframes.time - jnp.where(spent, 2 * (jnp.abs(time) + 1), 0.0))
-    row = jnp.where(keep, jnp.argmin(since), capacity).astype(jnp.int32)
+    distance = _distance(keyframes, T_world_lidar)
+    alone = ~jnp.any(keyframes.sparse & ~_is_free(keyframes) & (distance < params.spacing))
+    row = jnp.argmax(_dispensable(keyframes, time - keyframes.time, distance, time, params))
+    row = jnp.where(keep, row, capacity).astype(jnp.int32)
     corner, corners = _compacted(cloud.corner, cloud.corner_mask)
     surface, surfaces = _compacted(cloud.surface, cloud.surface_mask)
 
@@ -131,7 +149,50 @@ def with_keyframe(
         surface=put(keyframes.surface, surface),
         corners=put(keyframes.corners, corners),
         surfaces=put(keyframes.surfaces, surfaces),
+        number=put(keyframes.number, keyframes.count),
         last=jnp.where(keep, row, keyframes.last),
+        count=keyframes.count + keep.astype(jnp.int32),
+    )
+
+
+def with_page(keyframes: Keyframes, page: Page, T_world_lidar: jaxlie.SE3, params: SubmapParams) -> Keyframes:
+    """Return the keyframes with one that comes back, which the map does not hold yet.
+
+    It takes a free row, or that of a keyframe that is neither sparse nor recent, or of one that is farther
+    away than itself. Nothing changes where there is no such row, or where the keyframe has a row already.
+
+    Args:
+        keyframes: all that have a row; donate them.
+        page: the keyframe; it counts as sparse.
+        T_world_lidar: current pose.
+        params: ``recent`` (s).
+    """
+    now = keyframes.time[keyframes.last]
+    distance = _distance(keyframes, T_world_lidar)
+    is_recent = keyframes.time >= now - params.recent
+    order = _dispensable(keyframes, distance, jnp.where(is_recent, -jnp.inf, distance), now, params)
+    there = jnp.linalg.norm(page.T_world_lidar.translation() - T_world_lidar.translation())
+    row = jnp.argmax(order)
+    fits = (order[row] > there) & ~jnp.any(keyframes.number == page.number)
+    row = jnp.where(fits, row, len(keyframes.time)).astype(jnp.int32)
+    corner, corners = _compacted(page.cloud.corner, page.cloud.corner_mask)
+    surface, surfaces = _compacted(page.cloud.surface, page.cloud.surface_mask)
+
+    def put(rows: Array, value: Array | bool) -> Array:
+        return rows.at[row].set(value, mode="drop")
+
+    return Keyframes(
+        T_world_lidar=jaxlie.SE3(put(keyframes.T_world_lidar.wxyz_xyz, page.T_world_lidar.wxyz_xyz)),
+        time=put(keyframes.time, page.time),
+        sparse=put(keyframes.sparse, True),
+        entered=put(keyframes.entered, False),
+        corner=put(keyframes.corner, corner),
+        surface=put(keyframes.surface, surface),
+        corners=put(keyframes.corners, corners),
+        surfaces=put(keyframes.surfaces, surfaces),
+        number=put(keyframes.number, page.number),
+        last=keyframes.last,
+        count=keyframes.count,
     )
 
 
@@ -168,6 +229,34 @@ def next_to_enter(
     )
     pose = jaxlie.SE3(keyframes.T_world_lidar.wxyz_xyz[row])
     return eqx.tree_at(lambda k: k.entered, keyframes, entered), pose, cloud
+
+
+_SPENT = 1e9
+"""Added to the order of a keyframe that the map no longer needs: more than any distance or age."""
+
+
+def _dispensable(
+    keyframes: Keyframes,
+    of_spent: Float[Array, " k"],
+    of_others: Float[Array, " k"],
+    time: Float[Array, ""],
+    params: SubmapParams,
+) -> Float[Array, " k"]:
+    """Return an order in which rows are given away, the largest first: free rows, spent keyframes, others.
+
+    Args:
+        keyframes: all that have a row.
+        of_spent: order among the keyframes that are neither sparse nor recent.
+        of_others: order among the others.
+        time: current time, s.
+        params: ``recent`` (s).
+    """
+    spent = ~keyframes.sparse & (keyframes.time < time - params.recent)
+    return jnp.where(_is_free(keyframes), jnp.inf, jnp.where(spent, _SPENT + of_spent, of_others))
+
+
+def _is_free(keyframes: Keyframes) -> Bool[Array, " k"]:
+    return jnp.isinf(keyframes.time)
 
 
 def _distance(keyframes: Keyframes, T_world_lidar: jaxlie.SE3) -> Float[Array, " k"]:

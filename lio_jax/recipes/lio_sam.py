@@ -13,6 +13,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -31,7 +32,7 @@ from lio_jax.lidar.features import (
     check_sizes,
 )
 from lio_jax.mapping.feature_map import Submap, empty_feature_map
-from lio_jax.mapping.keyframes import no_keyframes
+from lio_jax.mapping.keyframes import Keyframes, Page, no_keyframes, with_page
 from lio_jax.recipes.inertial_filter import levelled_start, lidar_pose
 from lio_jax.recipes.lio_sam_params import LioSamConfig, LioSamParams
 from lio_jax.recipes.lio_sam_stages import (
@@ -50,7 +51,7 @@ from lio_jax.recipes.lio_sam_stages import (
     scan_to_map,
     smooth,
 )
-from lio_jax.recipes.recipe import Needs, Output, Recipe
+from lio_jax.recipes.recipe import KeyframeTable, Needs, Output, Recipe
 from lio_jax.recipes.smoothed_odometry import measured_attitude, opened
 
 
@@ -156,7 +157,34 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
             map=added.submap,
         )
         output = _output(nav, clock, features, match, smoothing, added)
-        return new_state, dataclasses.replace(output, covariance=drift.added_to(NavEstimate(nav, covariance)))
+        return new_state, dataclasses.replace(
+            output,
+            covariance=drift.added_to(NavEstimate(nav, covariance)),
+            keyframes=_table(state.map.keyframes, added.submap.keyframes, clock),
+        )
+
+    def with_page(self, params: LioSamParams, state: LioSamState, page: Page) -> LioSamState:
+        """Return the state with a keyframe that has lost its row and comes back.
+
+        Args:
+            params: traced.
+            state: after a scan; donate it.
+            page: the keyframe.
+        """
+        here = lidar_pose(state.nav)
+        keyframes = with_page(state.map.keyframes, page, here, params.submap)
+        return eqx.tree_at(lambda some: some.map.keyframes, state, keyframes)
+
+
+def _table(before: Keyframes, after: Keyframes, clock: Clock) -> KeyframeTable:
+    """Return which keyframes there are after a scan."""
+    is_added = after.count > before.count
+    return KeyframeTable(
+        numbers=after.number,
+        added=jnp.where(is_added, before.count, -1),
+        sparse=is_added & after.sparse[after.last],
+        time=clock.time,
+    )
 
 
 def _output(

@@ -101,8 +101,8 @@ class LioSamSizes:
     lidar_noise: Literal["fixed", "information"] = static("fixed")
     """Noise of a scan match in the smoother: the fixed sigmas of ``params.smoother``, or its information."""
     keyframes: int = static(256, above=0)
-    """Capacity of keyframes. Beyond it the oldest keyframe is dropped, first among those that the submap no
-    longer needs."""
+    """Capacity of keyframes on the device. Beyond it the submap's spent keyframes are dropped first, then the
+    farthest ones. A run keeps these on the host, and they come back near the vehicle."""
     corner_points: int = static(2048, above=0)
     """Capacity of the corners that are matched with the map, after thinning."""
     surface_points: int = static(8192, above=0)

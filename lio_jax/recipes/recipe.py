@@ -4,7 +4,7 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.innovation import Innovation
+from lio_jax.mapping.keyframes import Page
 from lio_jax.recipes.params import RecipeConfig, RecipeParams
 from lio_jax.registration.gauss_newton import Registration
 from lio_jax.registration.params import RegistrationParams
@@ -31,6 +32,19 @@ class Evidence(eqx.Module):
     """Covariance of the predicted lidar pose, for the same perturbation."""
     points: PointEvidence | None = None
     """Statistics of the points' distances; None from recipes whose map has no distributions."""
+
+
+class KeyframeTable(eqx.Module):
+    """Which keyframes a recipe holds after a scan, and whether the scan is one."""
+
+    numbers: Int32[Array, " k"]
+    """Running numbers of the keyframes that have a row; -1 in a free row."""
+    added: Int32[Array, ""]
+    """Running number of the scan as a keyframe; -1 where it is none."""
+    sparse: Bool[Array, ""]
+    """The keyframe stays in the map for good."""
+    time: Float[Array, ""]
+    """The scan's time on the keyframes' clock, s."""
 
 
 class Output(eqx.Module):
@@ -72,6 +86,8 @@ class Output(eqx.Module):
     """True if a new piece of map begins with the scan, at the predicted pose."""
     restarted: Bool[Array, ""] | None = None
     """True if the smoother diverged and was started again; None from recipes without a smoother."""
+    keyframes: KeyframeTable | None = None
+    """The keyframes of the submap; None from recipes without keyframes."""
     smoother_unfinished: Bool[Array, ""] | None = None
     """The match converged, and the smoother reached its largest number of linearisations; None from recipes
     without one."""
@@ -110,6 +126,15 @@ _CONVINCING = 0.25
 """Share of a scan's points that have to meet the map after an outage."""
 _ENOUGH = 4.0
 """A scan begins a new piece of map if it has this many times ``params.registration.min_matches`` points."""
+
+
+@runtime_checkable
+class PagingRecipe(Protocol):
+    """A recipe that takes back keyframes for which it had no more room."""
+
+    def with_page(self, params: Any, state: Any, page: Page) -> Any:
+        """Return a state with a keyframe that comes back; ``state`` is consumed."""
+        ...
 
 
 class Outage(eqx.Module):

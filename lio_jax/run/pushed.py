@@ -115,7 +115,7 @@ class PushedOdometry:
         self._parts = (
             InputsInTurn(self.settings, self._feed),
             step,
-            StepsInTurn(step),
+            StepsInTurn(step, pager=step.pager()),
             ResultBuilder(self.settings),
         )
 

@@ -16,9 +16,11 @@ from lio_jax.core.xla import programs
 from lio_jax.data.sequence import LidarScan, prefetched
 from lio_jax.data.trajectory import pose_matrices
 from lio_jax.recipes.params import RecipeParams as Params
+from lio_jax.recipes.recipe import PagingRecipe
 from lio_jax.recipes.transforms import RecipeLike, Stepper, reopened, with_first_velocity
 from lio_jax.run.failures import BridgedOutage, OutageWatch, ScanEvidence, failure_of, longest_gap
 from lio_jax.run.journal import Journal
+from lio_jax.run.paging import KeyframePager
 from lio_jax.run.scan_inputs import ImuFeed, InputsInTurn, ScanInput
 from lio_jax.run.shown_motion import MotionCheck, ShownMotion
 from lio_jax.settings.settings import Settings, recipe_of
@@ -120,7 +122,12 @@ class CompiledStep(Compiled):
 
     def __init__(self, settings: Settings) -> None:
         """Look for the programs; those that are missing are compiled on first use."""
-        super().__init__(recipe_of(settings), settings.params())
+        self.recipe = recipe_of(settings)
+        super().__init__(self.recipe, settings.params())
+
+    def pager(self) -> KeyframePager | None:
+        """Return a new pager of keyframes; None where the recipe has none."""
+        return KeyframePager(self.recipe, self.params) if isinstance(self.recipe, PagingRecipe) else None
 
 
 def track(
@@ -143,15 +150,17 @@ def track(
         journal: gives back the steps of a killed run, which are not computed again, and stores the others.
     """
     step = step or CompiledStep(settings)
-    judged = ResultBuilder(settings)
+    judged, pager = ResultBuilder(settings), step.pager()
     held: tuple[Any, ...] | None = None
     # closing: whoever stops early must not leave the decoding thread and its files behind
     with ThreadPoolExecutor(1) as reader, closing(scan_inputs(settings, scans, imu)) as inputs:
         for fed, nav, output, step_ms in journal.replayed(step, inputs) if journal else ():
+            if pager is not None:
+                pager.take(output)
             yield judged(fed, nav, output.registration, output, step_ms)
         compiled_s = step.compile_s
         try:
-            for fed, state, output in run_steps(step, inputs, journal.state if journal else None):
+            for fed, state, output in run_steps(step, inputs, journal.state if journal else None, pager):
                 reading = reader.submit(on_host, state.nav, output.registration)
                 compiled_in_step_s, compiled_s = step.compile_s - compiled_s, step.compile_s
                 if held is not None:
@@ -244,14 +253,17 @@ class StepsInTurn:
     how fast the vehicle was.
     """
 
-    def __init__(self, stepper: Stepper, state: Any = None) -> None:
+    def __init__(self, stepper: Stepper, state: Any = None, pager: KeyframePager | None = None) -> None:
         """Begin a run.
 
         Args:
             stepper: of the run.
             state: after a usable scan before the first one here; it is consumed. None: the run is new.
+            pager: hands back keyframes; it has taken the outputs of the scans before the first one here.
+                None: what a recipe has no more room for is lost.
         """
-        self._stepper = stepper
+        self._stepper, self._pager = stepper, pager
+        self._last: Any = None
         self._state = state
         self._opened = state is not None
         self._held: tuple[ScanInput, Any, Any] | None = None
@@ -259,23 +271,34 @@ class StepsInTurn:
     def take(self, fed: ScanInput) -> Iterator[tuple[ScanInput, Any, Any]]:
         """Yield scans with the state and the output after each; a state is consumed when the next is asked
         for."""
-        state = self._state
+        state = self._paged()
         if self._held is not None:
             first, state, output = self._held
             self._held = None
             if fed.usable:
                 first = replace(first, begun_at=time.perf_counter())
                 state, output = reopened(self._stepper, state, output, first, fed)
+            if self._pager is not None:
+                self._pager.take(output)
             yield first, state, output
         fed = replace(fed, begun_at=time.perf_counter())
         begins = fed.usable and not self._opened
         if state is None or begins:
             state = self._stepper.init(fed.before)
         self._state, output = self._stepper.step(state, fed.scan, fed.imu)
+        self._last = output
         if begins:
             self._held, self._opened = (fed, self._state, output), True
         else:
             yield fed, self._state, output
+
+    def _paged(self) -> Any:
+        """Return the state after the last scan, with a keyframe that comes back."""
+        if self._pager is None or self._held is not None or self._state is None:
+            return self._state
+        if self._last is not None:
+            self._pager.take(self._last)
+        return self._pager.paged(self._state)
 
     def rest(self) -> Iterator[tuple[ScanInput, Any, Any]]:
         """Yield the first usable scan where no other one came after it."""
@@ -285,7 +308,10 @@ class StepsInTurn:
 
 
 def run_steps(
-    stepper: Stepper, scan_inputs: Iterable[ScanInput], state: Any = None
+    stepper: Stepper,
+    scan_inputs: Iterable[ScanInput],
+    state: Any = None,
+    pager: KeyframePager | None = None,
 ) -> Iterator[tuple[ScanInput, Any, Any]]:
     """Yield each scan with the state and the output after it; the state is consumed by the next one.
 
@@ -296,8 +322,9 @@ def run_steps(
         scan_inputs: in time order.
         state: after a usable scan before these, from which to go on; it is consumed. None: these are the
             first ones.
+        pager: hands back keyframes, see :class:`StepsInTurn`.
     """
-    steps = StepsInTurn(stepper, state)
+    steps = StepsInTurn(stepper, state, pager)
     try:
         for fed in scan_inputs:
             yield from steps.take(fed)

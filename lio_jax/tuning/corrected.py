@@ -112,7 +112,8 @@ def corrected_run(recording: Recording, settings: Settings) -> CorrectedRun:
     back_end = BackEnd(settings, LoopCloser(settings) if backend.loops else None, gate)
     picker, build = KeyframePicker(settings), ResultBuilder(settings)
     stamps, poses, seen, truth = [], [], [], []
-    for fed, state, output in run_steps(CompiledStep(settings), recording.scan_inputs()):
+    step = CompiledStep(settings)
+    for fed, state, output in run_steps(step, recording.scan_inputs(), pager=step.pager()):
         observed = jax.tree.map(np.array, Observed.of(state, output))
         registration = jax.tree.map(np.array, output.registration)
         result = build(fed, observed.nav, registration, output, 0.0)

@@ -8,13 +8,22 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.mapping.keyframes import KeyframeCloud, is_due, next_to_enter, no_keyframes, with_keyframe
+from lio_jax.mapping.keyframes import (
+    KeyframeCloud,
+    Page,
+    is_due,
+    next_to_enter,
+    no_keyframes,
+    with_keyframe,
+    with_page,
+)
 from tests.params import default_params
 
 CORNERS, SURFACES = 8, 16
 PARAMS = default_params().submap
 _add = jax.jit(partial(with_keyframe, params=PARAMS))
 _enter = jax.jit(partial(next_to_enter, params=PARAMS))
+_page = jax.jit(partial(with_page, params=PARAMS))
 
 
 def pose(x: float, y: float = 0.0, yaw: float = 0.0) -> jaxlie.SE3:
@@ -106,3 +115,59 @@ def test_rows_of_what_is_not_needed_any_more_are_taken_first():
     np.testing.assert_array_equal(held[-11:], np.arange(19, 30))
     assert held[0] == 18
     assert int(keyframes.last) == int(np.argmax(np.asarray(keyframes.time)))
+
+
+def page(keyframes, number: int, x: float, here: float):
+    """Return the keyframes after a keyframe comes back, the vehicle being at ``here``."""
+    back = Page(jnp.int32(number), pose(x), jnp.asarray(float(number)), cloud(number))
+    return _page(keyframes, back, pose(here))
+
+
+def drive(capacity: int, count: int):
+    """Return keyframes four metres and four seconds apart: all are sparse, and three are recent."""
+    keyframes = empty(capacity)
+    for number in range(count):
+        keyframes = added(keyframes, pose(4.0 * number), 4.0 * number, number)
+    return keyframes
+
+
+def numbers(keyframes) -> list[int]:
+    return sorted(np.asarray(keyframes.number).tolist())
+
+
+def test_the_farthest_keyframe_loses_its_row():
+    keyframes = drive(8, 12)
+    assert numbers(keyframes) == list(range(4, 12))
+    # back again: the far ones are the latest
+    keyframes = added(keyframes, pose(16.5), 100.0, 12)
+    assert numbers(keyframes) == [4, 5, 6, 7, 8, 9, 10, 12]
+
+
+def test_a_keyframe_comes_back_in_the_place_of_one_that_is_farther_away():
+    keyframes = page(drive(8, 12), 3, 12.0, here=14.0)
+    # 44 m is the farthest, but recent
+    assert numbers(keyframes) == [3, 4, 5, 6, 7, 9, 10, 11]
+    row = int(np.argmax(np.asarray(keyframes.number) == 3))
+    assert bool(keyframes.sparse[row])
+    keyframes, T, found = _enter(keyframes, pose(11.0), jnp.asarray(48.0))
+    np.testing.assert_allclose(T.translation(), [12.0, 0.0, 0.0])
+    held = cloud(3)
+    np.testing.assert_array_equal(
+        np.asarray(found.surface)[found.surface_mask], np.asarray(held.surface)[held.surface_mask]
+    )
+
+
+def test_a_keyframe_does_not_come_back_twice_nor_in_the_place_of_a_nearer_one():
+    keyframes = drive(8, 12)
+    for changed in (page(keyframes, 5, 20.0, here=20.0), page(keyframes, 0, 0.0, here=40.0)):
+        jax.tree.map(np.testing.assert_array_equal, changed, keyframes)
+
+
+def test_a_free_row_and_one_that_is_spent_are_taken_first():
+    keyframes = page(drive(16, 12), 40, -9.0, here=0.0)
+    assert numbers(keyframes)[-1] == 40
+    assert numbers(keyframes).count(-1) == 3
+    # at 1 m: within the spacing of the one at 0 m
+    keyframes = added(drive(13, 12), pose(1.0), 48.0, 12)
+    keyframes = added(keyframes, pose(60.0), 100.0, 13)
+    assert numbers(keyframes) == [*range(12), 13]
