@@ -4,6 +4,8 @@ Source: Shan et al., "LIO-SAM: Tightly-coupled lidar inertial odometry via smoot
 section III.C, with the choice of its program: the near keyframes, thinned to a spacing, and the latest ones.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
@@ -134,22 +136,9 @@ def with_keyframe(
     alone = ~jnp.any(keyframes.sparse & ~_is_free(keyframes) & (distance < params.spacing))
     row = jnp.argmax(_dispensable(keyframes, time - keyframes.time, distance, time, params))
     row = jnp.where(keep, row, capacity).astype(jnp.int32)
-    corner, corners = _compacted(cloud.corner, cloud.corner_mask)
-    surface, surfaces = _compacted(cloud.surface, cloud.surface_mask)
-
-    def put(rows: Array, value: Array | bool) -> Array:
-        return rows.at[row].set(value, mode="drop")
-
-    return Keyframes(
-        T_world_lidar=jaxlie.SE3(put(keyframes.T_world_lidar.wxyz_xyz, T_world_lidar.wxyz_xyz)),
-        time=put(keyframes.time, time),
-        sparse=put(keyframes.sparse, alone),
-        entered=put(keyframes.entered, True),
-        corner=put(keyframes.corner, corner),
-        surface=put(keyframes.surface, surface),
-        corners=put(keyframes.corners, corners),
-        surfaces=put(keyframes.surfaces, surfaces),
-        number=put(keyframes.number, keyframes.count),
+    added = _with_row(keyframes, row, T_world_lidar, time, alone, True, cloud, keyframes.count)
+    return dataclasses.replace(
+        added,
         last=jnp.where(keep, row, keyframes.last),
         count=keyframes.count + keep.astype(jnp.int32),
     )
@@ -175,22 +164,36 @@ def with_page(keyframes: Keyframes, page: Page, T_world_lidar: jaxlie.SE3, param
     row = jnp.argmax(order)
     fits = (order[row] > there) & ~jnp.any(keyframes.number == page.number)
     row = jnp.where(fits, row, len(keyframes.time)).astype(jnp.int32)
-    corner, corners = _compacted(page.cloud.corner, page.cloud.corner_mask)
-    surface, surfaces = _compacted(page.cloud.surface, page.cloud.surface_mask)
+    return _with_row(keyframes, row, page.T_world_lidar, page.time, True, False, page.cloud, page.number)
+
+
+def _with_row(
+    keyframes: Keyframes,
+    row: Int32[Array, ""],
+    T_world_lidar: jaxlie.SE3,
+    time: Float[Array, ""],
+    sparse: Bool[Array, ""] | bool,
+    entered: bool,
+    cloud: KeyframeCloud,
+    number: Int32[Array, ""],
+) -> Keyframes:
+    """Return the keyframes with another one in a row; a row beyond the capacity changes nothing."""
+    corner, corners = _compacted(cloud.corner, cloud.corner_mask)
+    surface, surfaces = _compacted(cloud.surface, cloud.surface_mask)
 
     def put(rows: Array, value: Array | bool) -> Array:
         return rows.at[row].set(value, mode="drop")
 
     return Keyframes(
-        T_world_lidar=jaxlie.SE3(put(keyframes.T_world_lidar.wxyz_xyz, page.T_world_lidar.wxyz_xyz)),
-        time=put(keyframes.time, page.time),
-        sparse=put(keyframes.sparse, True),
-        entered=put(keyframes.entered, False),
+        T_world_lidar=jaxlie.SE3(put(keyframes.T_world_lidar.wxyz_xyz, T_world_lidar.wxyz_xyz)),
+        time=put(keyframes.time, time),
+        sparse=put(keyframes.sparse, sparse),
+        entered=put(keyframes.entered, entered),
         corner=put(keyframes.corner, corner),
         surface=put(keyframes.surface, surface),
         corners=put(keyframes.corners, corners),
         surfaces=put(keyframes.surfaces, surfaces),
-        number=put(keyframes.number, page.number),
+        number=put(keyframes.number, number),
         last=keyframes.last,
         count=keyframes.count,
     )
