@@ -7,9 +7,7 @@ import time
 from pathlib import Path
 
 # The older emitters compile a quarter faster; lio_jax.core.xla compiles the runner's programs by them too.
-os.environ.setdefault(
-    "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=true --xla_cpu_use_fusion_emitters=false"
-)
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=true --xla_cpu_use_fusion_emitters=false")
 
 import jax
 import pytest
