@@ -84,7 +84,8 @@ def test_the_state_is_donated():
             assert before.map.moments.is_deleted()
             assert not output.points.is_deleted()
     for one, other in zip(jax.tree.leaves(state), jax.tree.leaves(kept[-1].state), strict=True):
-        np.testing.assert_array_equal(one, other)
+        # the two programs are compiled differently
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
 def test_single_precision_states_where_x64_is_off():
