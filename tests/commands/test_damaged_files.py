@@ -325,13 +325,13 @@ def test_a_rotation_of_another_system_whose_squares_overflow(refused, tmp_path):
 
 def test_weights_of_a_graph_that_are_too_far_apart(refused, accepted, tmp_path):
     source, out = tmp_path / "in.g2o", tmp_path / "out.g2o"
-    lines = [f"VERTEX_SE2 {i} {i} 0 0.1" for i in range(4)]
+    lines = [f"VERTEX_SE2 {i} {i} 0 0.3" for i in range(4)]
     for i, j, weight in ((0, 1, "1e30"), (1, 2, "1"), (2, 3, "1"), (0, 3, "1")):
         lines.append(f"EDGE_SE2 {i} {j} {j - i} 0 0 1 0 0 {weight} 0 1")
     source.write_text("\n".join([*lines, "FIX 0"]) + "\n")
-    # the edges determine no first guess; the solve then begins at the vertices' own poses, and whether it
-    # ends is a matter of rounding
-    assert all("in.g2o: not converged" in warning for warning in accepted("optimize-graph", source, out))
+    # the edges determine no first guess; the solve then begins at the vertices' own poses
+    (warning,) = accepted("optimize-graph", source, out)
+    assert "in.g2o: not converged" in warning
     assert "nan" not in out.read_text()
     sentence = refused("optimize-graph", source, out, "--robust")
     assert "in.g2o: its equations have no solution; some weight is far too large or too small." in sentence

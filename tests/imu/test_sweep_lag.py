@@ -82,8 +82,8 @@ def test_white_noise_lags_as_in_the_mean_of_perturbed_motions(sweep_start):
 def test_a_sweep_of_no_duration_does_not_lag():
     begun = NavEstimate(NAV, 0.01 * jnp.eye(DOF))
     covariance = np.asarray(swept(begun, IMU, PARAMS, START, END, END)[0].covariance)
-    np.testing.assert_allclose(covariance[LAG], 0, atol=1e-15)
-    np.testing.assert_allclose(covariance[:, LAG], 0, atol=1e-15)
+    np.testing.assert_allclose(covariance[LAG], 0, atol=1e-18)
+    np.testing.assert_allclose(covariance[:, LAG], 0, atol=1e-18)
 
 
 def test_a_constant_velocity_error_lags_by_half_the_sweep():
