@@ -252,7 +252,8 @@ def _field_docs(kind: type) -> dict[str, str]:
     """Return the docstrings below the fields of a class and its bases."""
     docs: dict[str, str] = {}
     for one in reversed(kind.__mro__):
-        if "__annotations__" not in vars(one) or one.__module__.startswith("equinox"):
+        # a class without fields may have no source, such as those of collections.abc
+        if not inspect.get_annotations(one) or one.__module__.startswith("equinox"):
             continue
         body = ast.parse(textwrap.dedent(inspect.getsource(one))).body[0]
         assert isinstance(body, ast.ClassDef)

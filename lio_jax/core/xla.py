@@ -21,16 +21,25 @@ def computed_once(tree: _Tree) -> _Tree:
 
     XLA's CPU backend fuses a chain of elementwise operations and gathers into each of its uses. So it repeats
     the chain for every column of a result. It ignores optimization barriers, but it does not optimise across
-    a conditional whose condition is unknown at compile time.
+    a conditional whose condition is unknown at compile time. Other backends have barriers; there a
+    conditional waits for the host.
 
     Args:
         tree: a pytree of arrays; its first leaf has at least one element.
     """
+    if _platform() != "cpu":
+        return jax.lax.optimization_barrier(tree)
     first = jax.tree.leaves(tree)[0].ravel()[0].astype(jnp.float32)
     always = (first < 0) | (first >= 0) | (first != first)
     return jax.lax.cond(
         always, lambda leaves: leaves, lambda leaves: jax.tree.map(jnp.zeros_like, leaves), tree
     )
+
+
+def _platform() -> str:
+    """Return the platform for which programs are compiled, such as "cpu" or "gpu"."""
+    chosen = jax.config.jax_default_device
+    return str(getattr(chosen, "platform", chosen or jax.default_backend()))
 
 
 _PIECE = 256
@@ -111,7 +120,7 @@ def compiled(function: Any, *arguments: Any) -> jax.stages.Compiled:
     finally:
         if collecting:
             gc.enable()
-    if jax.default_backend() != "cpu":
+    if _platform() != "cpu":
         return lowered.compile()
     try:
         return lowered.compile(compiler_options=_CPU_OPTIONS)

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.leaf import numbers_of, sections_of, settings_of, traced
+from lio_jax.core.leaf import section as declared_section
+from lio_jax.imu.params import ImuParams
 from lio_jax.recipes import RECIPES
 from tests.params import DEFAULTS, Params, default_params, params_from_values
 
@@ -27,6 +30,19 @@ def test_every_setting_says_what_it_means(recipe):
         for path, setting in settings_of(tree).items():
             assert setting.doc.endswith("."), path
             assert not setting.doc.startswith("Of "), path
+
+
+def test_a_base_class_without_source_or_fields_is_no_obstacle():
+    # an abstract class of Python, such as Hashable, has such annotations once somebody has asked for them
+    bare = type("Bare", (), {"__annotations__": {}})
+
+    class Numbers(ImuParams, bare):
+        pass
+
+    class Tree(eqx.Module):
+        imu: Numbers = declared_section(Numbers)
+
+    assert settings_of(Tree)["imu.gyro_noise"].doc.endswith(".")
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
