@@ -105,7 +105,8 @@ class CloudFolder:
             )
         if not kinds and any(file.suffix.lower() == COMPRESSED_SUFFIX for file in entries(self._path)):
             raise LioJaxError(
-                f"{self._path}: holds compressed clouds ({COMPRESSED_SUFFIX}), which are not read; {DECOMPRESS}."
+                f"{self._path}: holds compressed clouds ({COMPRESSED_SUFFIX}), which are not read; "
+                f"{DECOMPRESS}."
             )
         if not kinds:
             raise LioJaxError(

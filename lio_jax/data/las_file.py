@@ -64,9 +64,7 @@ def read_las(path: Path, warn: Callable[[str], None]) -> NDArray[Any] | None:
         whole = (size - header.offset_to_point_data) // header.point_format.size
         records = reader.read_points(min(header.point_count, whole)).array
     if len(records) < header.point_count:
-        warn(
-            f"{path}: truncated ({len(records)} of {header.point_count} points): its whole points are used."
-        )
+        warn(f"{path}: truncated ({len(records)} of {header.point_count} points): its whole points are used.")
     return _points(records, header)
 
 

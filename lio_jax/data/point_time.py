@@ -135,8 +135,8 @@ def recognise_point_time(
         config: overrides, and the scan period to use where there is only one scan.
         stamped: whether the header stamps are recorded; false where scans are only counted.
     """
-    samples = [replace(one, low=_bounded(one.low), high=_bounded(one.high)) for one in samples]
     period = scan_period([sample.header_ns for sample in samples], config.scan_period)
+    samples = _possible(samples)
     spread = float(np.median([sample.high - sample.low for sample in samples]))
     if spread < _LEAST_TICKS:
         return None
@@ -230,6 +230,12 @@ def _anchor(
             return "end", "header stamp at scan end (times are negative)"
         return "inside", f"header stamp {-low:.3f} s into the scan (times of both signs)"
     return stamp_end(samples, sweep, config)
+
+
+def _possible(samples: Sequence[TimeSample]) -> list[TimeSample]:
+    """Return the samples whose ticks are possible in the shortest unit; if there are none all, bounded."""
+    possible = [one for one in samples if max(abs(one.low), abs(one.high)) < FARTHEST_NS]
+    return possible or [replace(one, low=_bounded(one.low), high=_bounded(one.high)) for one in samples]
 
 
 def _bounded(ticks: float | int) -> float | int:

@@ -1,4 +1,4 @@
-"""LAS files: every layout of points that laspy writes, and damaged headers, against the sweep that was written."""
+"""LAS files: every layout of points that laspy writes, and damaged headers, against the sweep written."""
 
 import struct
 from io import BytesIO
