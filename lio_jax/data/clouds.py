@@ -103,12 +103,12 @@ class CloudFolder:
                 f"{self._path}: holds clouds of several kinds ({numbers}); leave one kind there and move the "
                 "others elsewhere."
             )
-        if not kinds and any(file.suffix.lower() == COMPRESSED_SUFFIX for file in entries(self._path)):
-            raise LioJaxError(
-                f"{self._path}: holds compressed clouds ({COMPRESSED_SUFFIX}), which are not read; "
-                f"{DECOMPRESS}."
-            )
         if not kinds:
+            if any(file.suffix.lower() == COMPRESSED_SUFFIX for file in entries(self._path)):
+                raise LioJaxError(
+                    f"{self._path}: holds compressed clouds ({COMPRESSED_SUFFIX}), which are not read; "
+                    f"{DECOMPRESS}."
+                )
             raise LioJaxError(
                 f"{self._path}: holds no clouds ({', '.join(CLOUD_SUFFIXES)}); give a folder with one file "
                 "for each scan."

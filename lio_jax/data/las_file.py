@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lio_jax.core.errors import LioJaxError
 
 COMPRESSED_SUFFIX = ".laz"
-"""Ending of compressed LAS files, which are not read: on damaged ones their library ends the process."""
+"""Ending of compressed LAS files, which are not read: their library ends the process on a damaged one."""
 DECOMPRESS = "decompress them to .las (for example with laszip, PDAL or CloudCompare)"
 
 _SIZES = struct.Struct("<94xHII")
@@ -69,7 +69,7 @@ def read_las(path: Path, warn: Callable[[str], None]) -> NDArray[Any] | None:
 
 
 def _check_sizes(file: BinaryIO, size: int) -> None:
-    """Raise ValueError where laspy would take minutes or much memory; the file is left at its begin."""
+    """Raise ValueError where laspy would take minutes or much memory; then go back to the file's start."""
     head = file.read(_SIZES.size)
     file.seek(0)
     if len(head) < _SIZES.size or not head.startswith(b"LASF"):
