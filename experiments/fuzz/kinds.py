@@ -151,6 +151,7 @@ KINDS = (
     _clouds("ply", "*.ply", (mutations.raw, mutations.raw, mutations.whole)),
     _clouds("npy", "*.npy", (mutations.raw, mutations.raw, mutations.whole)),
     _clouds("bin", "*.bin", (mutations.raw, mutations.whole)),
+    _clouds("las", "*.las", (*(mutations.number("las"),) * 4, mutations.raw, mutations.raw, mutations.whole)),
     Kind(
         "tum",
         "poses",

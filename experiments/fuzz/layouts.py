@@ -125,10 +125,28 @@ def sqlite_pages(data: bytes) -> Iterator[Number]:
         yield from (Number(page + begins + place, 1) for place in range(12))
 
 
+def las_header(data: bytes) -> Iterator[Number]:
+    """Yield the numbers of a LAS file's header, and of its records of variable length."""
+    yield from (Number(place, size) for place, size in ((6, 2), (24, 1), (25, 1), (94, 2), (96, 4), (100, 4)))
+    # format and size of a point, numbers of points, then scales and offsets
+    yield from (Number(104, 1), Number(105, 2), Number(107, 4))
+    yield from (Number(place, 8) for place in range(131, 179, 8))
+    start, _, records = struct.unpack_from("<HII", data, 94)
+    if data[25] >= 4:
+        yield from (Number(235, 8), Number(243, 4), Number(247, 8))
+    for _ in range(records):
+        yield from (Number(start + 18, 2), Number(start + 20, 2))
+        body = start + 54
+        # type and options of each extra dimension
+        start = body + int.from_bytes(data[start + 20 : start + 22], "little")
+        yield from (Number(place, 1) for entry in range(body, start, 192) for place in (entry + 2, entry + 3))
+
+
 NUMBERS: dict[str, Callable[[bytes], Iterator[Number]]] = {
     "ros1": ros1_records,
     "messages": ros1_messages,
     "mcap": mcap_records,
     "sqlite": sqlite_pages,
+    "las": las_header,
 }
 """Finders of numbers, by the name of a layout."""

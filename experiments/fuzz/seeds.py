@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from laspy import ExtraBytesParams, LasData, LasHeader
 from pypcd4 import Encoding, PointCloud
 from scipy.spatial.transform import Rotation
 
@@ -219,7 +220,7 @@ def _write_kitti_raw(day: Path) -> None:
 
 def _write_clouds(root: Path) -> None:
     """Write the scans as a folder of clouds in each format; text files lie beside those of ``text``."""
-    for name in ("binary", "compressed", "text", "ply", "npy", "bin"):
+    for name in ("binary", "compressed", "text", "ply", "npy", "bin", "las"):
         (root / name).mkdir(parents=True)
     scans = [_scan(number) for number in range(_SCANS)]
     for scan in scans:
@@ -239,6 +240,7 @@ def _write_clouds(root: Path) -> None:
         (root / "ply" / f"{scan.stamp_ns}.ply").write_bytes(ply)
         np.save(root / "npy" / f"{scan.stamp_ns}.npy", rows[:, :4])
         rows[:, :4].tofile(root / "bin" / f"{scan.stamp_ns}.bin")
+        _write_las(root / "las" / f"{scan.stamp_ns}.las", scan)
     seconds = "".join(f"{scan.stamp_ns / 1e9:.6f}\n" for scan in scans)
     (root / "text" / "times.txt").write_text(seconds)
     imu = _imu(80)
@@ -247,6 +249,18 @@ def _write_clouds(root: Path) -> None:
         lines.append(",".join(map(str, (stamp_ns, *gyro, *accel))))
     (root / "text" / "imu.csv").write_text("\n".join(lines) + "\n")
     write_tum(root / "text" / "truth.tum", _truth())
+
+
+def _write_las(path: Path, scan: LidarScan) -> None:
+    header = LasHeader(version="1.4", point_format=6)
+    header.scales = np.full(3, 1e-3)
+    header.add_extra_dims([ExtraBytesParams("ring", "u2"), ExtraBytesParams("time", "f4")])
+    las = LasData(header)
+    las.xyz = scan.points
+    las.intensity = scan.intensity
+    las.gps_time = scan.stamp_ns * 1e-9 + scan.time
+    las.ring, las.time = scan.ring, scan.time
+    las.write(path)
 
 
 def _write_texts(root: Path) -> None:

@@ -117,6 +117,8 @@ _TIME = (
     "stamp",
     "timestamps",
     "stamps",
+    "gps_time",
+    "gpstime",
 )
 _RING = ("ring", "line", "channel", "laser_id", "laserid", "laser", "beam", "ring_id")
 _INTENSITY = ("intensity", "intensities", "reflectivity", "signal", "reflectance", "i")

@@ -1,4 +1,4 @@
-"""Read single files of points: PCD, PLY, NumPy arrays, and KITTI's binary rows."""
+"""Read single files of points: PCD, PLY, LAS, NumPy arrays, and KITTI's binary rows."""
 
 from collections.abc import Callable, Iterator
 from itertools import islice
@@ -8,6 +8,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from lio_jax.core.errors import LioJaxError
+from lio_jax.data.las_file import read_las
 from lio_jax.data.sequence import check_still_there
 from lio_jax.data.velodyne_file import read_returns
 
@@ -28,11 +30,13 @@ def read_cloud(path: Path, warn: Warn) -> NDArray[Any] | None:
         warn: function that takes each sentence.
 
     Raises:
-        LioJaxError: the whole folder is gone.
+        LioJaxError: the whole folder is gone, or the library of the format is not installed.
     """
     try:
         return _READERS[path.suffix.lower()](path, warn)
-    # pypcd4 and the parsers of numpy raise exceptions of many kinds on damaged bytes
+    except LioJaxError:
+        raise
+    # pypcd4, laspy and the parsers of numpy raise exceptions of many kinds on damaged bytes
     except Exception as error:
         check_still_there(path)
         reason = " ".join(str(error).split()) or type(error).__name__
@@ -170,6 +174,7 @@ _READERS: dict[str, Callable[[Path, Warn], NDArray[Any] | None]] = {
     ".ply": _ply,
     ".npy": _npy,
     ".bin": _bin,
+    ".las": read_las,
 }
 CLOUD_SUFFIXES = tuple(_READERS)
 """Endings of the files that are read as clouds."""

@@ -16,6 +16,7 @@ from lio_jax.data.cloud_stamps import CloudStamps, stamps_of
 from lio_jax.data.config import DataConfig
 from lio_jax.data.imu_checks import accel_scale
 from lio_jax.data.imu_text import read_imu_text
+from lio_jax.data.las_file import COMPRESSED_SUFFIX, DECOMPRESS
 from lio_jax.data.scan_reading import ScanReading, recognise_clouds
 from lio_jax.data.sequence import (
     GpsData,
@@ -39,7 +40,7 @@ _LONGEST_IN_MM = 300_000.0
 
 
 class CloudFolder:
-    """A folder of .pcd, .ply, .npy or .bin files."""
+    """A folder of .pcd, .ply, .npy, .bin or .las files."""
 
     def __init__(self, path: Path, config: DataConfig) -> None:
         """Order the files in time, and settle from the first clouds how they are read.
@@ -103,6 +104,11 @@ class CloudFolder:
                 "others elsewhere."
             )
         if not kinds:
+            if any(file.suffix.lower() == COMPRESSED_SUFFIX for file in entries(self._path)):
+                raise LioJaxError(
+                    f"{self._path}: holds compressed clouds ({COMPRESSED_SUFFIX}), which are not read; "
+                    f"{DECOMPRESS}."
+                )
             raise LioJaxError(
                 f"{self._path}: holds no clouds ({', '.join(CLOUD_SUFFIXES)}); give a folder with one file "
                 "for each scan."
@@ -228,7 +234,7 @@ def _is_folder_of_clouds(path: Path) -> bool:
     if ".bin" in suffixes and (path.name == "velodyne" or path.parent.name == "velodyne_points"):
         # a KITTI recording holds more than its scans
         return False
-    return not suffixes.isdisjoint(CLOUD_SUFFIXES)
+    return not suffixes.isdisjoint((*CLOUD_SUFFIXES, COMPRESSED_SUFFIX))
 
 
 READER = Reader(

@@ -16,7 +16,7 @@ overridden in :class:`~lio_jax.core.config.DataConfig`:
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -32,6 +32,10 @@ _CLEARLY_RECEIVED_LATER = 0.002
 """Latency above which a receipt is evidence, s: in converted bags the receipt equals the stamp."""
 _LONGEST_LATENCY = 5.0
 """Latency above which the recorder's clock differs from the sensor's, s."""
+_MOST_TICKS = 1e30
+"""Ticks beyond this are impossible in any unit, and are read as this limit: sums and products stay finite."""
+_LEAST_TICKS = 1e-30
+"""Differences of ticks below this are none: quotients stay above zero."""
 
 
 @dataclass(frozen=True)
@@ -71,10 +75,10 @@ class PointTiming:
         longest = 2.0 * self.sweep * 1e9 / self.tick_ns
         if time.size == 0 or self.can_be_scan(time.min().item(), time.max().item()):
             return None
-        middle = float(np.median(time.astype(np.float64)))
+        ticks = np.clip(time.astype(np.float64), -_MOST_TICKS, _MOST_TICKS)
+        middle = float(np.median(ticks))
         if not abs(middle) * self.tick_ns < FARTHEST_NS:
             return np.ones(time.shape, bool)
-        ticks = time.astype(np.float64)
         beyond = ~(np.abs(ticks) * self.tick_ns < FARTHEST_NS)
         wrong: NDArray[np.bool_] = (np.abs(ticks - middle) > 0.75 * longest) | beyond
         return wrong
@@ -132,8 +136,9 @@ def recognise_point_time(
         stamped: whether the header stamps are recorded; false where scans are only counted.
     """
     period = scan_period([sample.header_ns for sample in samples], config.scan_period)
+    samples = _possible(samples)
     spread = float(np.median([sample.high - sample.low for sample in samples]))
-    if spread <= 0:
+    if spread < _LEAST_TICKS:
         return None
     absolute = (
         _is_absolute(samples, spread)
@@ -181,7 +186,7 @@ def _unit(samples: Sequence[TimeSample], spread: float, period: float, absolute:
     ticks, nanoseconds = spread, period * 1e9
     if absolute:
         first, last = min(samples, key=_header), max(samples, key=_header)
-        if last.header_ns > first.header_ns and last.low > first.low:
+        if last.header_ns > first.header_ns and last.low - first.low > _LEAST_TICKS:
             ticks, nanoseconds = float(last.low - first.low), float(last.header_ns - first.header_ns)
         elif first.header_ns > 0 and first.low > 0:
             since_epoch = {unit: first.low * tick / first.header_ns for unit, tick in TICK_NS.items()}
@@ -225,6 +230,16 @@ def _anchor(
             return "end", "header stamp at scan end (times are negative)"
         return "inside", f"header stamp {-low:.3f} s into the scan (times of both signs)"
     return stamp_end(samples, sweep, config)
+
+
+def _possible(samples: Sequence[TimeSample]) -> list[TimeSample]:
+    """Return the samples whose ticks are possible in the shortest unit; if there are none all, bounded."""
+    possible = [one for one in samples if max(abs(one.low), abs(one.high)) < FARTHEST_NS]
+    return possible or [replace(one, low=_bounded(one.low), high=_bounded(one.high)) for one in samples]
+
+
+def _bounded(ticks: float | int) -> float | int:
+    return max(-_MOST_TICKS, min(ticks, _MOST_TICKS))
 
 
 def _header(sample: TimeSample) -> int:

@@ -1,5 +1,6 @@
 """Folders of clouds: every file format and every way to state stamps, against the sweep that was written."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -198,7 +199,7 @@ def test_times_that_do_not_fit_are_an_error(tmp_path: Path, text: str) -> None:
 def test_an_empty_folder_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(LioJaxError, match=r"the folder is empty; give .*a folder of clouds"):
         open_sequence(tmp_path)
-    with pytest.raises(LioJaxError, match=r"holds no clouds \(\.pcd, \.ply, \.npy, \.bin\)"):
+    with pytest.raises(LioJaxError, match=r"holds no clouds \(\.pcd, \.ply, \.npy, \.bin, \.las\)"):
         opened(tmp_path)
 
 
@@ -300,6 +301,12 @@ def test_a_folder_without_a_readable_cloud_is_an_error(tmp_path: Path) -> None:
 def test_other_arrays_are_an_error(tmp_path: Path, array: np.ndarray) -> None:
     with pytest.raises(LioJaxError, match="has neither 3 columns"):
         opened(folder(tmp_path, ["1.npy"], npy_bytes(array)))
+
+
+def test_las_without_its_library_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    with pytest.raises(LioJaxError, match=r"1\.las: .* install it with pip install 'lio-jax\[las\]'"):
+        opened(folder(tmp_path, ["1.las", "2.las"], b"LASF"))
 
 
 def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:

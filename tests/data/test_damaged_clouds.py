@@ -43,6 +43,44 @@ def test_a_scan_whose_times_are_impossible_has_no_points(tmp_path, wrong):
     assert f"{POINTS} points with impossible times were dropped" in " ".join(sequence.warnings_so_far)
 
 
+def with_times(times: np.ndarray) -> bytes:
+    """Return the cloud as an .npy file whose times are float64 numbers."""
+    plain = packed(CLOUD)
+    kinds = [(one, np.dtype("<f8") if one == "time" else plain.dtype[one]) for one in plain.dtype.names or ()]
+    changed = plain.astype(kinds)
+    changed["time"] = times
+    return npy_bytes(changed)
+
+
+ARRAYS = [name.replace("pcd", "npy") for name in NAMES]
+
+
+@pytest.mark.parametrize("named", [True, False])
+@pytest.mark.parametrize("absolute", [True, False])
+@pytest.mark.parametrize("wrong", [1e305, -1.7e308])
+@pytest.mark.parametrize("which", [slice(3, 4), slice(None), slice(None, None, 2)])
+@pytest.mark.parametrize("damaged", [range(1), range(2, 3), range(4)])
+def test_times_near_the_limit_of_float64_overflow_nowhere(tmp_path, damaged, which, wrong, absolute, named):
+    for number in range(4):
+        times = SEEN.time.astype(np.float64) + absolute * (bags.START_NS * 1e-9 + 0.1 * number)
+        if number in damaged:
+            times[which] = wrong
+        name = ARRAYS[number] if named else f"{number}.npy"
+        folder(tmp_path, [name], with_times(times))
+    sequence = opened(tmp_path)
+    scans = list(sequence.scans())
+    assert all(np.isfinite(scan.time).all() and abs(scan.stamp_ns) < FARTHEST_NS for scan in scans)
+    if damaged != range(4):
+        assert sum(len(scan.points) == POINTS for scan in scans) == 3
+        assert "points with impossible times were dropped" in " ".join(sequence.warnings_so_far)
+
+
+def test_times_that_hardly_differ_count_as_equal(tmp_path):
+    times = np.where(np.arange(POINTS) % 2, 5e-324, -5e-324)
+    sequence = opened(folder(tmp_path, ARRAYS, with_times(times)))
+    assert any("holds a single value, reconstructed from azimuth" in note for note in sequence.info.notes)
+
+
 @pytest.mark.parametrize("wrong", [-5e23, 5e23])
 def test_one_impossible_time_in_the_first_scan_leaves_possible_stamps(tmp_path, wrong):
     """The spread of the first scans, by which times are recognised, is then impossible too."""

@@ -1,6 +1,7 @@
 """The fuzz campaign: a short one finds nothing, and its judge, its watch and its shortening work."""
 
 import os
+from io import BytesIO
 from pathlib import Path
 from random import Random
 
@@ -144,6 +145,20 @@ def test_numbers_of_every_layout_lie_in_the_file(tmp_path):
             numbers = list(NUMBERS[layout](file.read_bytes()))
             assert len(numbers) > 50
             assert max(number.offset for number in numbers) > 5000
+
+
+def test_numbers_of_a_las_header_decide_how_its_points_are_read():
+    laspy = pytest.importorskip("laspy", reason="laspy is not installed; it comes with lio-jax[las]")
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.add_extra_dims([laspy.ExtraBytesParams("ring", "u2"), laspy.ExtraBytesParams("time", "f4")])
+    file = BytesIO()
+    laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(7, header=header)).write(file)
+    data = file.getvalue()
+    numbers = {
+        int.from_bytes(data[one.offset : one.offset + one.size], "little") for one in NUMBERS["las"](data)
+    }
+    uint16, float32 = 3, 9  # types of extra dimensions, LAS 1.4, table 24
+    assert numbers >= {6, header.point_format.size, 7, len(data) - 7 * 36, 2 * 192, uint16, float32}
 
 
 def test_actions_that_keep_the_form_of_an_array():
