@@ -52,6 +52,8 @@ from .recipes.recipe import Recipe as Recipe
 from .recipes.recipe import State as State
 from .registration.voxel_planes import associate as associate
 from .registration.voxel_planes import point_noise as point_noise
+from .run.known_map import KnownMap as KnownMap
+from .run.localise import localise as localise
 from .run.pushed import PushedOdometry as PushedOdometry
 from .run.run import imu_feed as imu_feed
 from .run.run import run_sequence as run_sequence

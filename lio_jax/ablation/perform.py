@@ -62,7 +62,7 @@ def _batches(tasks: list[Task], sequence: Sequence) -> Iterator[list[Task]]:
     import jax
 
     size = tasks[0].batch or (1 if jax.default_backend() == "cpu" else _LARGEST_BATCH)
-    if size == 1 or tasks[0].keep == "everything":
+    if size == 1 or tasks[0].keep == "everything" or tasks[0].settings.run.known_map.path:
         yield from ([task] for task in tasks)
         return
     groups: dict[Any, list[Task]] = {}

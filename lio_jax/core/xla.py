@@ -38,7 +38,7 @@ def computed_once(tree: _Tree) -> _Tree:
 
 def _platform() -> str:
     """Return the platform for which programs are compiled, such as "cpu" or "gpu"."""
-    chosen = jax.config.jax_default_device
+    chosen: Any = getattr(jax.config, "jax_default_device")  # noqa: B009 -- its type is not declared
     return str(getattr(chosen, "platform", chosen or jax.default_backend()))
 
 

@@ -1,4 +1,4 @@
-"""Parameters of the back end: loops, GPS fixes and the pose graph of keyframes."""
+"""Parameters of the back end (loops, GPS fixes, pose graph of keyframes), and of a start in a known map."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -97,6 +97,29 @@ class GpsParams(eqx.Module):
     """Drift of the odometry that the consistency test of fixes allows, per metre travelled."""
     yaw_sigma: Scalar = leaf(0.1, "rad", above=0)
     """The heading counts as known once its standard deviation is below this."""
+
+
+class KnownMapParams(eqx.Module):
+    """Where a run begins in a known map."""
+
+    position: Float[Array, "3"] = leaf((0.0, 0.0, 0.0), "m")
+    """Position of the IMU at the first scan, in the map's world; by default where the map's run began."""
+    heading: Scalar = leaf(0.0, "rad")
+    """Heading of the IMU's x axis at the first scan, from the map's x axis, counterclockwise."""
+    position_error: Scalar = leaf(5.0, "m", above=0, most=15)
+    """Largest horizontal error of ``position``."""
+    heading_error: Scalar = leaf(0.5, "rad", above=0)
+    """Largest error of ``heading``; 3.15 tries all headings."""
+
+
+@dataclass(frozen=True)
+class KnownMapConfig:
+    """The map of an earlier run, in whose world a run takes place."""
+
+    path: str = static("")
+    """Folder of the earlier run, or a map of it (.pcd or .ply); empty: the run begins a map of its own."""
+    search: bool = static(False)
+    """Search the start along the trajectory of the earlier run; false: it is at ``params.known_map``."""
 
 
 @dataclass(frozen=True)

@@ -129,7 +129,7 @@ def _turned(centres: _Plan, weight: _Plan, angle: float) -> _Plan:
 
 _Array = NDArray[np.float64]
 
-_SPACING = 0.4
+ALIGNED_SPACING = 0.4
 """Edge of the cubes to which the aligned points are thinned, m."""
 _BELIEVED = 0.03
 """Share of an alignment's information that is believed, because neighbouring points share the map's error."""
@@ -187,7 +187,7 @@ def verify(
     theirs = level_points(keyframes, poses, target, members, TARGET_REACH)
     before = same_piece(keyframes, source, range(max(0, source - sizes.source_keyframes + 1), source + 1))
     ours = level_points(keyframes, poses, source, before, SOURCE_REACH)
-    theirs, ours = thinned(theirs, _SPACING), thinned(ours, _SPACING)
+    theirs, ours = thinned(theirs, ALIGNED_SPACING), thinned(ours, ALIGNED_SPACING)
     their_cells, their_upright = upright_cells(theirs)
     our_cells, our_upright = upright_cells(ours)
     if min(np.sum(their_upright), np.sum(our_upright)) < LEAST_POINTS:
@@ -209,9 +209,9 @@ def verify(
     result = aligned(
         *padded(theirs, sizes.target_points),
         *padded(ours, sizes.source_points),
-        _guesses(found, stations),
+        guesses_at(found, stations),
         sizes.starts,
-        _aligning_params(settings),
+        aligning_params(settings),
     )
     comparison = CloudComparison(theirs, stations, ours[our_upright], limits["overlap_distance"])
     candidates = comparison.candidates(result, poses[[target, source]])
@@ -314,7 +314,7 @@ def _level(T_target_source: _Array, T_world_target: _Array, T_world_source: _Arr
     return level
 
 
-def _guesses(found: Fits, targets: _Array) -> _Array:
+def guesses_at(found: Fits, targets: _Array) -> _Array:
     """Return the (n, 4, 4) poses of the fits, m, at the height of the nearest of the target's keyframes.
 
     Args:
@@ -329,7 +329,7 @@ def _guesses(found: Fits, targets: _Array) -> _Array:
     return guesses
 
 
-def _aligning_params(settings: BackEndSettings) -> AlignmentParams:
+def aligning_params(settings: BackEndSettings) -> AlignmentParams:
     """Return the parameters of the alignment: the run's where its recipe has them, else the defaults."""
     values = {
         section: {name: settings.values[section].get(name, default) for name, default in leaves.items()}

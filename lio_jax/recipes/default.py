@@ -3,7 +3,13 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
 from lio_jax.core.types import ImuBatch, Scan
+from lio_jax.mapping.voxel_map import anchor_of, insert
 from lio_jax.recipes import lidar_inertial, lidar_odometry
 from lio_jax.recipes.default_params import DefaultConfig, DefaultParams
 from lio_jax.recipes.recipe import Output, Recipe
@@ -43,3 +49,24 @@ class Default(Recipe[DefaultConfig, DefaultParams, DefaultState]):
             return lidar_odometry.step(self.config, params, state, scan)
         assert imu is not None
         return lidar_inertial.step(self.config, params, state, scan, imu)
+
+    def placed(self, params: DefaultParams, state: DefaultState, T_world_imu: jaxlie.SE3) -> DefaultState:
+        """Return a state before the first scan at a pose in a known map's world."""
+        if isinstance(state, lidar_odometry.LidarState):
+            return lidar_odometry.placed(state, T_world_imu)
+        return lidar_inertial.placed(state, T_world_imu)
+
+    def with_map_points(
+        self,
+        params: DefaultParams,
+        state: DefaultState,
+        points: Float[Array, "n 3"],
+        mask: Bool[Array, " n"],
+        origin: Float[Array, "3"],
+    ) -> DefaultState:
+        """Return a state with points of a known map, m, in world axes from ``origin``."""
+        anchor, corner = anchor_of(origin, params.map.voxel_size)
+        size, reach = (value.astype(jnp.float32) for value in (params.map.voxel_size, params.map.reach))
+        anchored = points + (origin - corner).astype(points.dtype)
+        vmap, _ = insert(state.map, anchored, mask, anchor, size, reach)
+        return eqx.tree_at(lambda one: one.map, state, vmap)

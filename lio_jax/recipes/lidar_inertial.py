@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int32
 
-from lio_jax.core.error_state import NavEstimate
+from lio_jax.core.error_state import DOF, GRAVITY, NavEstimate, sphere_basis
+from lio_jax.core.geometry import rotation_matrix
 from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.types import ITERATION_LIMIT, ImuBatch, NavState, Scan
 from lio_jax.estimation.map_drift import MapDrift
@@ -89,6 +90,25 @@ def init(config: DefaultConfig, params: DefaultParams, imu: ImuBatch) -> Inertia
         unmatched=jnp.zeros((), dtype),
         map=empty_map(config.map.capacity),
     )
+
+
+def placed(state: InertialState, T_world_imu: jaxlie.SE3) -> InertialState:
+    """Return a state before the first scan at another pose, in the world of a known map.
+
+    Errors are perturbations in the body's axes and stay what they are, but for the direction of gravity,
+    whose axes are those of the world. The pose is no longer certain.
+
+    Args:
+        state: of :func:`init`.
+        T_world_imu: in the map's world, whose z axis points upwards.
+    """
+    nav = state.nav
+    turn = rotation_matrix(T_world_imu.rotation() @ nav.T_world_imu.rotation().inverse())
+    basis = sphere_basis(nav.gravity)
+    carried = jnp.eye(DOF, dtype=turn.dtype).at[GRAVITY, GRAVITY].set(basis.T @ turn @ basis)
+    covariance = recipe.placed_covariance(carried @ state.covariance @ carried.T)
+    moved = eqx.tree_at(lambda one: (one.T_world_imu, one.velocity), nav, (T_world_imu, turn @ nav.velocity))
+    return eqx.tree_at(lambda one: (one.nav, one.covariance), state, (moved, covariance))
 
 
 def step(

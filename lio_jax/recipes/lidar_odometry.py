@@ -77,6 +77,23 @@ def init(config: DefaultConfig, params: DefaultParams) -> LidarState:
     )
 
 
+def placed(state: LidarState, T_world_imu: jaxlie.SE3) -> LidarState:
+    """Return a state before the first scan at another pose, in the world of a known map.
+
+    Args:
+        state: of :func:`init`.
+        T_world_imu: in the map's world, whose z axis points upwards.
+    """
+    nav = state.nav
+    turn = T_world_imu.rotation() @ nav.T_world_imu.rotation().inverse()
+    moved = dataclasses.replace(nav, T_world_imu=T_world_imu, velocity=turn @ nav.velocity)
+    return eqx.tree_at(
+        lambda one: (one.nav, one.T_world_lidar, one.uncertain.covariance),
+        state,
+        (moved, T_world_imu @ nav.T_imu_lidar, recipe.placed_covariance(state.uncertain.covariance)),
+    )
+
+
 def step(
     config: DefaultConfig, params: DefaultParams, state: LidarState, scan: Scan
 ) -> tuple[LidarState, Output]:

@@ -8,8 +8,10 @@ from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar, runtime_c
 
 import equinox as eqx
 import jax.numpy as jnp
+import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
+from lio_jax.core.error_state import DOF, POSITION, ROTATION
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.estimation.innovation import Innovation
 from lio_jax.mapping.keyframes import Page
@@ -135,6 +137,48 @@ class PagingRecipe(Protocol):
     def with_page(self, params: Any, state: Any, page: Page) -> Any:
         """Return a state with a keyframe that comes back; ``state`` is consumed."""
         ...
+
+
+@runtime_checkable
+class LocalisingRecipe(Protocol):
+    """A recipe that can begin in a map of an earlier run."""
+
+    def placed(self, params: Any, state: Any, T_world_imu: jaxlie.SE3) -> Any:
+        """Return a state before the first scan at a pose in the map's world; ``state`` is consumed."""
+        ...
+
+    def with_map_points(
+        self,
+        params: Any,
+        state: Any,
+        points: Float[Array, "n 3"],
+        mask: Bool[Array, " n"],
+        origin: Float[Array, "3"],
+    ) -> Any:
+        """Return a state with points of a known map; ``state`` is consumed.
+
+        Args:
+            params: traced.
+            state: of the recipe.
+            points: m, in world axes from ``origin``.
+            mask: which rows are real.
+            origin: position near the vehicle, m in world.
+        """
+        ...
+
+
+_PLACED_ROTATION, _PLACED_POSITION = 0.01, 0.1
+"""Standard deviations per axis of the pose at which a run begins in a known map, rad and m."""
+
+
+def placed_covariance(covariance: Float[Array, "24 24"]) -> Float[Array, "24 24"]:
+    """Return the covariance of a first state in a known map, where its pose is not certain.
+
+    Args:
+        covariance: of the error state at the start of a map of its own (:mod:`lio_jax.core.error_state`).
+    """
+    sigma = jnp.zeros(DOF, covariance.dtype).at[ROTATION].set(_PLACED_ROTATION)
+    return covariance + jnp.diag(sigma.at[POSITION].set(_PLACED_POSITION) ** 2)
 
 
 class Outage(eqx.Module):

@@ -5,7 +5,7 @@ After each scan the nearest of them that should be in the submap, and has lost i
 back depends on the outputs of the scans before alone, so that a resumed run repeats it.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,19 @@ from numpy.typing import NDArray
 from lio_jax.core.xla import programs
 from lio_jax.mapping.keyframes import KeyframeCloud, Page
 from lio_jax.recipes.recipe import Output, PagingRecipe
+
+
+@runtime_checkable
+class Pager(Protocol):
+    """Hands parts of the map to a recipe during a run."""
+
+    def take(self, output: Output) -> None:
+        """Take the output of the next scan."""
+        ...
+
+    def paged(self, state: Any) -> Any:
+        """Return a state with what comes after the scans so far, if anything; ``state`` is consumed."""
+        ...
 
 
 class _Stored(NamedTuple):

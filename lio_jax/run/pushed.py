@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from lio_jax.data.imu_checks import LARGEST
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
 from lio_jax.data.trajectory import Trajectory
-from lio_jax.run.run import feed_of, settings_for
-from lio_jax.run.scan_inputs import ImuFeed, InputsInTurn
+from lio_jax.run.localise import check_no_known_map
+from lio_jax.run.run import settings_for
+from lio_jax.run.scan_inputs import ImuFeed, InputsInTurn, feed_of
 from lio_jax.run.track import CompiledStep, ResultBuilder, ScanResult, StepsInTurn, on_host
 from lio_jax.settings.settings import Settings, uses_imu
 
@@ -46,7 +47,11 @@ class PushedOdometry:
             settings: recipe, config and params. What they leave open follows from the first scan with points,
                 as :func:`lio_jax.run.run.settings_for` takes it from a recording.
             T_imu_lidar: (4, 4) pose of the lidar in the IMU frame; None: that of the settings.
+
+        Raises:
+            UsageError: the settings name a known map.
         """
+        check_no_known_map(settings, "pushed data")
         self.settings = settings
         """Settings of the run; from the first scan with points on, nothing in them is open."""
         self.notes: list[str] = []

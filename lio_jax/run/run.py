@@ -12,10 +12,7 @@ from typing import Any
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.data.detect import without_effect
 from lio_jax.data.imu_checks import cleaned
-from lio_jax.data.sequence import ImuData, LidarScan, Sequence
-from lio_jax.imu.params import OrientedImuConfig
-from lio_jax.recipes import recipe_named
-from lio_jax.recipes.params import InertialConfig
+from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.run.clock_jumps import without_clock_jumps
 from lio_jax.run.fitted_settings import (
     fitted_to_surroundings,
@@ -28,13 +25,14 @@ from lio_jax.run.fitted_settings import (
 from lio_jax.run.folder import environment, write_json
 from lio_jax.run.global_correction import GlobalCorrection
 from lio_jax.run.journal import Journal
+from lio_jax.run.localise import LocalisingStep, step_of
 from lio_jax.run.logs import Failures, Overflow, ScanLog, StageTimes, TrajectoryLog
 from lio_jax.run.map_file import MapFile
-from lio_jax.run.scan_inputs import OFFSET_MARGIN_S, ImuFeed
+from lio_jax.run.scan_inputs import ImuFeed, feed_of
 from lio_jax.run.set_up_check import SetUpCheck
 from lio_jax.run.sinks import RunResult, Sink, finish_all
 from lio_jax.run.state_files import ImuRateFile, StateFiles
-from lio_jax.run.track import CompiledStep, ScanResult, track
+from lio_jax.run.track import ScanResult, track
 from lio_jax.run.verdict import Verdict
 from lio_jax.settings.settings import Settings, uses_imu, with_extrinsics
 
@@ -110,8 +108,8 @@ def run_sequence(
         check_start(sequence, start)
         out.mkdir(parents=True, exist_ok=True)
         began = time.perf_counter()
-        step = CompiledStep(settings)
         imu, imu_notes = imu_feed(sequence, settings)
+        step = step_of(sequence, settings, imu.samples if imu else None, start)
         log, times = TrajectoryLog(), StageTimes("decode", "pad", "step", "record", "total")
         # the log last: wherever Ctrl-C comes, the others have every scan that it has
         everyone: list[Sink] = [times, Overflow(settings), Failures(start)]
@@ -135,6 +133,8 @@ def run_sequence(
         if journal is not None:
             metrics["warnings"] += journal.warnings()
             metrics |= {"resumed_at_scan": start + journal.scans} if journal.scans else {}
+        if isinstance(step, LocalisingStep):
+            metrics["start_in_known_map"] = step.start.as_dict()
         run = RunResult(metrics=metrics, interruption=interruption)
         finish_all(everyone, run)
     run.metrics |= {
@@ -202,23 +202,6 @@ def imu_feed(sequence: Sequence, settings: Settings) -> tuple[ImuFeed | None, tu
     recorded, jumps = without_clock_jumps(sequence, settings, recorded)
     imu, found = cleaned(recorded, "IMU", sequence.info.T_imu_lidar)
     return feed_of(imu, settings), jumps + found
-
-
-def feed_of(imu: ImuData | None, settings: Settings) -> ImuFeed:
-    """Return a feed of checked samples as the settings of a recipe that uses them want it.
-
-    Args:
-        imu: all samples; None: there are none yet.
-        settings: of the run.
-    """
-    config = settings.config
-    assert isinstance(config, InertialConfig)
-    estimated = settings.values["initial"]["time_offset_sigma"] > 0
-    margin = OFFSET_MARGIN_S if estimated else 0.0
-    offset = settings.values["extrinsics"]["time_offset"]
-    own = isinstance(config.imu, OrientedImuConfig) and config.imu.orientation
-    bridge = recipe_named(settings.recipe).longest_bridged_gap
-    return ImuFeed(imu, config.imu.buckets, offset, margin, own, bridge)
 
 
 def _described(sequence: Sequence) -> dict[str, Any]:

@@ -11,7 +11,10 @@ from scipy.spatial.transform import Rotation
 from lio_jax.core.types import ImuBatch, Scan, state_dtype
 from lio_jax.data.imu_checks import coverage
 from lio_jax.data.sequence import ImuData, LidarScan
+from lio_jax.imu.params import OrientedImuConfig
 from lio_jax.lidar.params import ScanConfig
+from lio_jax.recipes import recipe_named
+from lio_jax.recipes.params import InertialConfig
 from lio_jax.run.shown_motion import first_velocity
 from lio_jax.settings.settings import Settings
 
@@ -221,6 +224,23 @@ class ImuFeed:
         if self._with_orientation:
             arrays["orientation"] = values[:, 6:]
         return ImuBatch(**arrays)
+
+
+def feed_of(imu: ImuData | None, settings: Settings) -> ImuFeed:
+    """Return a feed of checked samples as the settings of a recipe that uses them want it.
+
+    Args:
+        imu: all samples; None: there are none yet.
+        settings: of the run.
+    """
+    config = settings.config
+    assert isinstance(config, InertialConfig)
+    estimated = settings.values["initial"]["time_offset_sigma"] > 0
+    margin = OFFSET_MARGIN_S if estimated else 0.0
+    offset = settings.values["extrinsics"]["time_offset"]
+    own = isinstance(config.imu, OrientedImuConfig) and config.imu.orientation
+    bridge = recipe_named(settings.recipe).longest_bridged_gap
+    return ImuFeed(imu, config.imu.buckets, offset, margin, own, bridge)
 
 
 @dataclass(frozen=True)

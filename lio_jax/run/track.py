@@ -20,7 +20,7 @@ from lio_jax.recipes.recipe import PagingRecipe
 from lio_jax.recipes.transforms import RecipeLike, Stepper, reopened, with_first_velocity
 from lio_jax.run.failures import BridgedOutage, OutageWatch, ScanEvidence, failure_of, longest_gap
 from lio_jax.run.journal import Journal
-from lio_jax.run.paging import KeyframePager
+from lio_jax.run.paging import KeyframePager, Pager
 from lio_jax.run.scan_inputs import ImuFeed, InputsInTurn, ScanInput
 from lio_jax.run.shown_motion import MotionCheck, ShownMotion
 from lio_jax.settings.settings import Settings, recipe_of
@@ -125,8 +125,8 @@ class CompiledStep(Compiled):
         self.recipe = recipe_of(settings)
         super().__init__(self.recipe, settings.params())
 
-    def pager(self) -> KeyframePager | None:
-        """Return a new pager of keyframes; None where the recipe has none."""
+    def pager(self) -> Pager | None:
+        """Return what hands parts of the map over during a new run; None where nothing does."""
         return KeyframePager(self.recipe, self.params) if isinstance(self.recipe, PagingRecipe) else None
 
 
@@ -253,14 +253,14 @@ class StepsInTurn:
     how fast the vehicle was.
     """
 
-    def __init__(self, stepper: Stepper, state: Any = None, pager: KeyframePager | None = None) -> None:
+    def __init__(self, stepper: Stepper, state: Any = None, pager: Pager | None = None) -> None:
         """Begin a run.
 
         Args:
             stepper: of the run.
             state: after a usable scan before the first one here; it is consumed. None: the run is new.
-            pager: hands back keyframes; it has taken the outputs of the scans before the first one here.
-                None: what a recipe has no more room for is lost.
+            pager: hands parts of the map over; it has taken the outputs of the scans before the first one
+                here. None: what a recipe has no more room for is lost.
         """
         self._stepper, self._pager = stepper, pager
         self._last: Any = None
@@ -293,7 +293,7 @@ class StepsInTurn:
             yield fed, self._state, output
 
     def _paged(self) -> Any:
-        """Return the state after the last scan, with a keyframe that comes back."""
+        """Return the state after the last scan, with what the pager hands over."""
         if self._pager is None or self._held is not None or self._state is None:
             return self._state
         if self._last is not None:
@@ -311,7 +311,7 @@ def run_steps(
     stepper: Stepper,
     scan_inputs: Iterable[ScanInput],
     state: Any = None,
-    pager: KeyframePager | None = None,
+    pager: Pager | None = None,
 ) -> Iterator[tuple[ScanInput, Any, Any]]:
     """Yield each scan with the state and the output after it; the state is consumed by the next one.
 
@@ -322,7 +322,7 @@ def run_steps(
         scan_inputs: in time order.
         state: after a usable scan before these, from which to go on; it is consumed. None: these are the
             first ones.
-        pager: hands back keyframes, see :class:`StepsInTurn`.
+        pager: hands parts of the map over, see :class:`StepsInTurn`.
     """
     steps = StepsInTurn(stepper, state, pager)
     try:

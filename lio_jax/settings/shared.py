@@ -1,4 +1,4 @@
-"""Settings that every run has in addition to those of its recipe: reading, the back end, output."""
+"""Settings that every run has beside those of its recipe: reading, the back end, a known map, output."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,15 @@ import equinox as eqx
 
 from lio_jax.core.leaf import section, static
 from lio_jax.data.config import DataConfig
-from lio_jax.loops.params import BackendConfig, BackendParams, GpsParams, LoopParams, LoopsConfig
+from lio_jax.loops.params import (
+    BackendConfig,
+    BackendParams,
+    GpsParams,
+    KnownMapConfig,
+    KnownMapParams,
+    LoopParams,
+    LoopsConfig,
+)
 
 
 @dataclass(frozen=True)
@@ -29,17 +37,19 @@ class OutputConfig:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Static settings of the reader, the back end and the run folder."""
+    """Static settings of the reader, the back end, a known map and the run folder."""
 
     data: DataConfig = section(DataConfig)
     backend: BackendConfig = section(BackendConfig)
     loops: LoopsConfig = section(LoopsConfig)
+    known_map: KnownMapConfig = section(KnownMapConfig)
     output: OutputConfig = section(OutputConfig)
 
 
 class GlobalParams(eqx.Module):
-    """Numbers that the back end reads."""
+    """Numbers that the back end reads, and the start in a known map."""
 
     loop: LoopParams = section(LoopParams)
     backend: BackendParams = section(BackendParams)
     gps: GpsParams = section(GpsParams)
+    known_map: KnownMapParams = section(KnownMapParams)

@@ -9,6 +9,7 @@ import numpy as np
 from lio_jax.core.types import state_dtype
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory
+from lio_jax.run.localise import check_no_known_map
 from lio_jax.run.run import check_start, imu_feed
 from lio_jax.run.scan_inputs import ScanInput
 from lio_jax.run.track import scan_inputs
@@ -39,9 +40,10 @@ class Recording:
             keep: decode the scans once and keep them; False: anew each time, in constant memory.
 
         Raises:
-            UsageError: the recording ends before ``start``.
+            UsageError: the recording ends before ``start``, or the settings name a known map.
         """
         check_start(sequence, start)
+        check_no_known_map(settings, "gradients and tuning")
         self.name, self.sequence = sequence.info.name, sequence
         samples, self.notes = imu_feed(sequence, settings)
         self._truth = truth if truth is not None else sequence.truth()
