@@ -83,10 +83,12 @@ def tune(
     objective = options.objective or ("ate" if corrected else "noise")
     named, options = objective_named(objective), replace(options, objective=objective)
     optimiser = options.optimiser
-    if optimiser == "scoring" and not named.likelihood:
+    # a pose graph has no scores of single scans
+    scored = named.likelihood and not corrected
+    if optimiser == "scoring" and not scored:
         raise UsageError(
-            f"--optimizer scoring wants a likelihood ({', '.join([*SHORT, *LIKELIHOODS])}), "
-            f"not {options.objective}."
+            "--optimizer scoring works with parameters of the recipe and a likelihood "
+            f"({', '.join([*SHORT, *LIKELIHOODS])}), not with {options.params} and {options.objective}."
         )
     rings = partial(_rings_of, data[0], base)
 
@@ -104,11 +106,11 @@ def tune(
     if optimiser == "auto":
         # where points lie changes a loss by little, and every value of it changes choices
         moved = through_map and all(declared.moves_points for declared in free.declared)
-        optimiser = "scoring" if named.likelihood else "stationary" if moved else "lbfgsb"
+        optimiser = "scoring" if scored else "stationary" if moved else "lbfgsb"
     loss: Loss | CorrectedLoss = (
         CorrectedLoss(settings, free, named.objective)
         if corrected
-        else Loss(settings.recipe, settings.config, free, named.objective, through_map, named.likelihood)
+        else Loss(settings.recipe, settings.config, free, named.objective, through_map, scored)
     )
     session = Session(
         out,
@@ -116,7 +118,7 @@ def tune(
         loss,
         training,
         validation,
-        named.likelihood,
+        scored,
         options.patience,
         lambda iterate: _report(free, iterate),
     )
@@ -161,7 +163,8 @@ def _recordings(
         truth = truth_of(sequence, gt)
         if named.needs_truth and truth is None:
             raise UsageError(
-                f"{path}: holds no truth, which objective {options.objective} needs; give --gt FILE."
+                f"{path}: holds no truth, which objective {options.objective} needs; give --gt FILE, or an "
+                "--objective without truth (noise, or marginal for loops and GPS)."
             )
         if not recordings:
             settings, notes = settings_for(sequence, settings)
