@@ -196,8 +196,8 @@ class CorrectedLoss:
             run = corrected_run(recording, self._settings)
             if _is_evidence(self._objective) and not run.replayed.closed:
                 raise LioJaxError(
-                    f"{recording.name}: no loop and no fix is in the graph, so its likelihood does not depend "
-                    "on the back end; use a recording that returns to a place or has GPS fixes."
+                    f"{recording.name}: no loop and no fix is in the graph, so its likelihood does not "
+                    "depend on the parameters; use a recording that returns to a place or has GPS fixes."
                 )
             self._runs[id(recording)] = recording, run
         return self._runs[id(recording)][1]
