@@ -129,6 +129,11 @@ def tune(
         session.run(optimiser, first, _bounds(free, first), options.iterations, options.seed)
     _write(out, base, free, session)
     print(_table(free, session))
+    if at_limit := _at_limit(free, first, session.best):
+        say(
+            f"note: {', '.join(at_limit)} ended at the limit of the range: the objective has no minimum within "
+            "it, or is flat there."
+        )
     print(f"results    {out / 'tuned.yaml'} (use it as --recipe), {HISTORY}, tuning.png")
 
 
@@ -183,13 +188,25 @@ def _rings_of(path: Path, settings: Settings) -> int:
     return ring_count(open_sequence(path, settings.run.data).scans())
 
 
+def _reach(free: ParameterVector) -> np.ndarray:
+    """Return the largest change of each component from its start."""
+    return np.array([REACH.get(name.split(".")[1], math.log(FACTOR)) for name in free.names])
+
+
 def _bounds(free: ParameterVector, first: np.ndarray) -> Bounds:
-    width = np.array([REACH.get(name.split(".")[1], math.log(FACTOR)) for name in free.names])
+    width = _reach(free)
     upper = first + width
     for place, name in enumerate(free.names):
         if name == "registration.information_scale":
             upper[place] = 0.0
     return Bounds(first - width, np.maximum(upper, first))
+
+
+def _at_limit(free: ParameterVector, first: np.ndarray, iterate: Iterate) -> list[str]:
+    """Return the components that changed as far as the tuning lets them."""
+    change = np.abs(np.asarray(iterate.x) - first)
+    # the difference of a bound and the start is rounded
+    return [name for name, at in zip(free.names, change > 0.999 * _reach(free), strict=True) if at]
 
 
 def _prepare(out: Path, overwrite: bool) -> None:
