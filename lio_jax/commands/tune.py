@@ -131,8 +131,8 @@ def tune(
     print(_table(free, session))
     if at_limit := _at_limit(free, first, session.best):
         say(
-            f"note: {', '.join(at_limit)} ended at the limit of the range: the objective has no minimum within "
-            "it, or is flat there."
+            f"note: {', '.join(at_limit)} ended at the limit of the range; the objective has no minimum "
+            "within it, or is flat there."
         )
     print(f"results    {out / 'tuned.yaml'} (use it as --recipe), {HISTORY}, tuning.png")
 

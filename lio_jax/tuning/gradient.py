@@ -1,5 +1,6 @@
 """The gradient of a recording's objective in one line, and of the mean over several recordings."""
 
+import math
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass
 from typing import Literal
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.errors import UsageError
+from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.recipes import recipe_named
@@ -75,7 +76,8 @@ def gradient(
 
     Raises:
         UsageError: a parameter, an objective or a mode is not known, or can't be differentiated.
-        LioJaxError: the objective is a likelihood and does not depend on the parameters.
+        LioJaxError: the objective is a likelihood and does not depend on the parameters, or the pose graph
+            has no unique solution.
     """
     if mode not in ("auto", "forward", "reverse"):
         raise UsageError(f"mode '{mode}' is not known; there are: auto, forward, reverse.")
@@ -85,6 +87,11 @@ def gradient(
         free = free_of_back_end(resolved, patterns, named)
         recording = Recording(sequence, resolved, start, count, truth, keep=False)
         found = CorrectedLoss(resolved, free, named.objective)(np.asarray(free.first()), [recording])
+        if not math.isfinite(found.value):
+            raise LioJaxError(
+                f"{recording.name}: the objective is not finite, because the pose graph has no unique solution "
+                "with these parameters; check them with lio-jax run."
+            )
         if named.likelihood and not found.gradient.any():
             raise nothing_depends(free.names)
         return NamedGradient(found.value, _by_name(free, found.gradient), (), False)
