@@ -89,8 +89,8 @@ def gradient(
         found = CorrectedLoss(resolved, free, named.objective)(np.asarray(free.first()), [recording])
         if not math.isfinite(found.value):
             raise LioJaxError(
-                f"{recording.name}: the objective is not finite, because the pose graph has no unique solution "
-                "with these parameters; check them with lio-jax run."
+                f"{recording.name}: the objective is not finite, because the pose graph has no unique "
+                "solution with these parameters; check them with lio-jax run."
             )
         if named.likelihood and not found.gradient.any():
             raise nothing_depends(free.names)
