@@ -73,8 +73,8 @@ def _on_host(
 ) -> tuple[NDArray, NDArray]:
     edges, dtype = np.asarray(blocks, np.float64), np.asarray(blocks).dtype
     size = edges.shape[-1] // 2
-    ends = (np.asarray(leaf, np.int64) for leaf in (i, j, kind))
-    structure = structure_from(*ends, np.asarray(held), size)
+    i, j, kind = (np.asarray(leaf, np.int64) for leaf in (i, j, kind))
+    structure = structure_from(i, j, kind, np.asarray(held), size)
     if not structure.count:
         return np.zeros((), dtype), np.zeros(edges.shape, dtype)
     try:
