@@ -257,8 +257,8 @@ def tune(
         str | None,
         arg(
             metavar="NAME",
-            help=f"One of {LISTED}, or a sum such as {EXAMPLE}; marginal needs lio_sam. None means noise, or "
-            "ate for parameters of loops and GPS.",
+            help=f"One of {LISTED}, or a sum such as {EXAMPLE}; marginal needs lio_sam, or "
+            "parameters of loops and GPS. None means noise, or ate for loops and GPS.",
         ),
     ] = None,
     recipe: Recipe = None,

@@ -83,10 +83,12 @@ def tune(
     objective = options.objective or ("ate" if corrected else "noise")
     named, options = objective_named(objective), replace(options, objective=objective)
     optimiser = options.optimiser
-    if optimiser == "scoring" and not named.likelihood:
+    # a pose graph has no scores of single scans
+    scored = named.likelihood and not corrected
+    if optimiser == "scoring" and not scored:
         raise UsageError(
-            f"--optimizer scoring wants a likelihood ({', '.join([*SHORT, *LIKELIHOODS])}), "
-            f"not {options.objective}."
+            "--optimizer scoring works with parameters of the recipe and a likelihood "
+            f"({', '.join([*SHORT, *LIKELIHOODS])}), not with {options.params} and {options.objective}."
         )
     rings = partial(_rings_of, data[0], base)
 
@@ -104,11 +106,11 @@ def tune(
     if optimiser == "auto":
         # where points lie changes a loss by little, and every value of it changes choices
         moved = through_map and all(declared.moves_points for declared in free.declared)
-        optimiser = "scoring" if named.likelihood else "stationary" if moved else "lbfgsb"
+        optimiser = "scoring" if scored else "stationary" if moved else "lbfgsb"
     loss: Loss | CorrectedLoss = (
         CorrectedLoss(settings, free, named.objective)
         if corrected
-        else Loss(settings.recipe, settings.config, free, named.objective, through_map, named.likelihood)
+        else Loss(settings.recipe, settings.config, free, named.objective, through_map, scored)
     )
     session = Session(
         out,
@@ -116,7 +118,7 @@ def tune(
         loss,
         training,
         validation,
-        named.likelihood,
+        scored,
         options.patience,
         lambda iterate: _report(free, iterate),
     )
@@ -127,6 +129,11 @@ def tune(
         session.run(optimiser, first, _bounds(free, first), options.iterations, options.seed)
     _write(out, base, free, session)
     print(_table(free, session))
+    if at_limit := _at_limit(free, first, session.best):
+        say(
+            f"note: {', '.join(at_limit)} ended at the limit of the range; the objective has no minimum "
+            "within it, or is flat there."
+        )
     print(f"results    {out / 'tuned.yaml'} (use it as --recipe), {HISTORY}, tuning.png")
 
 
@@ -161,7 +168,8 @@ def _recordings(
         truth = truth_of(sequence, gt)
         if named.needs_truth and truth is None:
             raise UsageError(
-                f"{path}: holds no truth, which objective {options.objective} needs; give --gt FILE."
+                f"{path}: holds no truth, which objective {options.objective} needs; give --gt FILE, or an "
+                "--objective without truth (noise, or marginal for loops and GPS)."
             )
         if not recordings:
             settings, notes = settings_for(sequence, settings)
@@ -180,13 +188,25 @@ def _rings_of(path: Path, settings: Settings) -> int:
     return ring_count(open_sequence(path, settings.run.data).scans())
 
 
+def _reach(free: ParameterVector) -> np.ndarray:
+    """Return the largest change of each component from its start."""
+    return np.array([REACH.get(name.split(".")[1], math.log(FACTOR)) for name in free.names])
+
+
 def _bounds(free: ParameterVector, first: np.ndarray) -> Bounds:
-    width = np.array([REACH.get(name.split(".")[1], math.log(FACTOR)) for name in free.names])
+    width = _reach(free)
     upper = first + width
     for place, name in enumerate(free.names):
         if name == "registration.information_scale":
             upper[place] = 0.0
     return Bounds(first - width, np.maximum(upper, first))
+
+
+def _at_limit(free: ParameterVector, first: np.ndarray, iterate: Iterate) -> list[str]:
+    """Return the components that changed as far as the tuning lets them."""
+    change = np.abs(np.asarray(iterate.x) - first)
+    # the difference of a bound and the start is rounded
+    return [name for name, at in zip(free.names, change > 0.999 * _reach(free), strict=True) if at]
 
 
 def _prepare(out: Path, overwrite: bool) -> None:

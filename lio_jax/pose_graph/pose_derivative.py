@@ -129,12 +129,14 @@ def _solve_on_host(
     solved = columns.copy()
     if structure.count:
         with one_thread():
-            factor = factorise(structure.plan, *_blocks(structure, hessians.reshape(-1, 2 * size, 2 * size)))
+            factor = factorise(
+                structure.plan, *hessian_blocks(structure, hessians.reshape(-1, 2 * size, 2 * size))
+            )
             solved[:, free] = solve_factored(factor, columns[:, free].transpose(1, 2, 0)).transpose(2, 0, 1)
     return solved.reshape(right.shape).astype(right.dtype)
 
 
-def _blocks(
+def hessian_blocks(
     structure: Structure, hessians: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the Hessian's blocks on the diagonal, and those of the pairs."""

@@ -1,4 +1,4 @@
-"""Objectives over the trajectory after loops and GPS, with gradients by the back end's parameters.
+"""Objectives of the pose graph after loops and GPS, with gradients by the back end's parameters.
 
 The choices of the back end are those of one run at the first parameters (see
 :mod:`lio_jax.tuning.replayed_graph`). So a loss costs one solve of the graph, and it is smooth.
@@ -28,7 +28,14 @@ from lio_jax.run.track import CompiledStep, ResultBuilder, run_steps
 from lio_jax.settings.settings import Settings
 from lio_jax.settings.shared import GlobalParams
 from lio_jax.tuning.evaluated import Evaluated
-from lio_jax.tuning.objectives import Named, Objective, Observed, TruePose
+from lio_jax.tuning.objectives import (
+    MarginalLikelihood,
+    Named,
+    Objective,
+    Observed,
+    TruePose,
+    WeightedSum,
+)
 from lio_jax.tuning.parameters import ParameterVector, free_parameters, named_leaves
 from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.replayed_graph import ReplayedGraph, replayed_graph
@@ -72,15 +79,23 @@ def free_of_back_end(settings: Settings, patterns: Listing[str], named: Named) -
         named: the objective.
 
     Raises:
-        UsageError: the objective does not see the corrected trajectory, or see
+        UsageError: the objective depends neither on the corrected trajectory nor on the graph, or see
             :func:`lio_jax.tuning.parameters.free_parameters`.
     """
-    if named.likelihood:
+    objective = named.objective
+    if isinstance(objective, WeightedSum) and any(map(_is_evidence, objective.parts)):
+        raise UsageError("for loops and GPS, marginal is no part of a sum; take marginal alone.")
+    if named.likelihood and not _is_evidence(objective):
         raise UsageError(
-            "loops and GPS change the corrected trajectory alone, which a likelihood does not see; take the "
-            "objective ate, rpe or rpe-rotation."
+            "a likelihood of single scans does not depend on loops and GPS; take the objective ate, rpe or "
+            "rpe-rotation, or marginal, which needs no truth."
         )
     return free_parameters(traced(GlobalParams, settings.values), list(patterns))
+
+
+def _is_evidence(objective: Objective) -> bool:
+    """Return whether the objective is the likelihood of the graph, not a loss of the trajectory."""
+    return isinstance(objective, MarginalLikelihood)
 
 
 class CorrectedRun(NamedTuple):
@@ -95,6 +110,10 @@ class CorrectedRun(NamedTuple):
     """Number of loops in the graph."""
     fixes: int
     """Number of fixes in the graph."""
+
+    def evidence_per_scan(self, params: GlobalParams) -> Float[Array, ""]:
+        """Return minus the log marginal likelihood of the graph over the number of scans."""
+        return self.replayed.negative_log_evidence(params) / len(self.seen)
 
 
 def corrected_run(recording: Recording, settings: Settings) -> CorrectedRun:
@@ -146,7 +165,8 @@ class CorrectedLoss:
             settings: at which the choices of the back end are made.
             free: its parameters.
             objective: of the corrected trajectory. It sees the corrected ``nav.T_world_imu``; all else is as
-                the odometry has it, and there is no ``scan``.
+                the odometry has it, and there is no ``scan``. :class:`MarginalLikelihood`: see
+                :meth:`ReplayedGraph.negative_log_evidence`, per scan.
         """
         self._settings, self._free, self._objective = settings, free, objective
         self._runs: dict[int, tuple[Recording, CorrectedRun]] = {}
@@ -166,9 +186,20 @@ class CorrectedLoss:
         return np.array([corrected_value(run, self._free, self._objective, jnp.asarray(x)) for x in xs])
 
     def run_over(self, recording: Recording) -> CorrectedRun:
-        """Return the run over a recording, which is made once."""
+        """Return the run over a recording, which is made once.
+
+        Raises:
+            LioJaxError: the objective is the likelihood of the graph, which has neither loops nor fixes; or
+                see :func:`corrected_run`.
+        """
         if id(recording) not in self._runs:
-            self._runs[id(recording)] = recording, corrected_run(recording, self._settings)
+            run = corrected_run(recording, self._settings)
+            if _is_evidence(self._objective) and not run.replayed.closed:
+                raise LioJaxError(
+                    f"{recording.name}: no loop and no fix is in the graph, so its likelihood does not "
+                    "depend on the parameters; use a recording that returns to a place or has GPS fixes."
+                )
+            self._runs[id(recording)] = recording, run
         return self._runs[id(recording)][1]
 
 
@@ -183,6 +214,9 @@ def corrected_gradient(
         objective: see :class:`CorrectedLoss`.
         x: (p,) where.
     """
+    if _is_evidence(objective):
+        evidence = push_forward(run.evidence_per_scan, free.with_tangents(x))
+        return float(evidence.value), np.asarray(evidence.dot, np.float64)
     poses = push_forward(run.replayed.corrected, free.with_tangents(x))
     arrays, static = split_objective(objective)
     add = programs(_add_with_tangents, static)
@@ -197,6 +231,8 @@ def corrected_gradient(
 
 def corrected_value(run: CorrectedRun, free: ParameterVector, objective: Objective, x: Array) -> float:
     """Return the objective of :func:`corrected_gradient` without its derivative."""
+    if _is_evidence(objective):
+        return float(run.evidence_per_scan(free(x)))
     poses = np.asarray(run.replayed.corrected(free(x)))
     arrays, static = split_objective(objective)
     add = programs(_add, static)

@@ -1,5 +1,6 @@
 """The gradient of a recording's objective in one line, and of the mean over several recordings."""
 
+import math
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass
 from typing import Literal
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.errors import UsageError
+from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.recipes import recipe_named
@@ -18,7 +19,7 @@ from lio_jax.run.run import settings_for
 from lio_jax.settings.settings import Settings, recipe_of, recipe_settings
 from lio_jax.tuning.corrected import CorrectedLoss, free_of_back_end, names_back_end
 from lio_jax.tuning.evaluated import Evaluated
-from lio_jax.tuning.objectives import Named, Objective, nothing_counts, objective_named
+from lio_jax.tuning.objectives import Named, Objective, nothing_counts, nothing_depends, objective_named
 from lio_jax.tuning.parameters import ParameterVector, free_parameters
 from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.reverse import TotalGradient, checkpointed_gradient
@@ -55,8 +56,8 @@ def gradient(
     the same process.
 
     With parameters of the back end (``loop.*``, ``gps.*``, ``backend.*``) it is that of the trajectory after
-    loops and GPS. The odometry and the choices of the back end are then constants, and ``mode`` and
-    ``through_map`` have no effect.
+    loops and GPS, and ``marginal`` is that of the pose graph. The odometry and the choices of the back end
+    are then constants, and ``mode`` and ``through_map`` have no effect.
 
     Args:
         sequence: the recording.
@@ -75,7 +76,8 @@ def gradient(
 
     Raises:
         UsageError: a parameter, an objective or a mode is not known, or can't be differentiated.
-        LioJaxError: the objective is a likelihood and no scan depends on the parameters.
+        LioJaxError: the objective is a likelihood and does not depend on the parameters, or the pose graph
+            has no unique solution.
     """
     if mode not in ("auto", "forward", "reverse"):
         raise UsageError(f"mode '{mode}' is not known; there are: auto, forward, reverse.")
@@ -85,6 +87,13 @@ def gradient(
         free = free_of_back_end(resolved, patterns, named)
         recording = Recording(sequence, resolved, start, count, truth, keep=False)
         found = CorrectedLoss(resolved, free, named.objective)(np.asarray(free.first()), [recording])
+        if not math.isfinite(found.value):
+            raise LioJaxError(
+                f"{recording.name}: the objective is not finite, because the pose graph has no unique "
+                "solution with these parameters; check them with lio-jax run."
+            )
+        if named.likelihood and not found.gradient.any():
+            raise nothing_depends(free.names)
         return NamedGradient(found.value, _by_name(free, found.gradient), (), False)
     free = free_parameters(resolved.params(), list(patterns), lambda: ring_count(sequence.scans()))
     recipe = recipe_of(resolved)

@@ -1,7 +1,7 @@
 """Objectives over a recording: what one is, those with and without ground truth, and their names."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -355,6 +355,14 @@ def nothing_counts(scans: int) -> LioJaxError:
         f"none of the {scans} scans tells of the parameters. A likelihood leaves out the scans that could "
         f"not be matched, and all but ranges leave out the first {OPENING}: use a longer recording, or "
         "parameters on which the objective depends."
+    )
+
+
+def nothing_depends(names: Sequence[str]) -> LioJaxError:
+    """Return the error of an objective that does not depend on any of the named parameters."""
+    return LioJaxError(
+        f"the objective does not depend on {', '.join(names)} at these values; name parameters of what the "
+        "recording has, or start from other values."
     )
 
 

@@ -1,4 +1,4 @@
-"""The corrected trajectory of a run as a function of the back end's parameters, with its choices held.
+"""A run's corrected trajectory and likelihood as functions of the back end's parameters, its choices held.
 
 Which keyframes, loops and fixes enter the graph, and which of them a robust solve rejects, are choices. They
 are those of a run of the back end. The odometry is a constant, too. What is left is a pose graph whose
@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 
 from lio_jax.loops.back_end import Correction, between_keyframes, graph_of
 from lio_jax.loops.edge_noise import fix_covariance, loop_covariance, odometry_covariance
+from lio_jax.pose_graph.factors import edge_costs
 from lio_jax.pose_graph.graph import LOOP, ODOMETRY, POSITION, PoseGraph, Poses, picked, poses_from
+from lio_jax.pose_graph.log_determinant import log_determinant
 from lio_jax.pose_graph.pose_derivative import solved_poses
 from lio_jax.settings.shared import GlobalParams
 
@@ -50,12 +52,34 @@ class ReplayedGraph(eqx.Module):
     elevation: bool = eqx.field(static=True)
     """Whether the height of the fixes is used."""
 
+    @property
+    def closed(self) -> bool:
+        """Return whether a loop or a fix contradicts the odometry; without them the cost is zero."""
+        return bool(np.isin(np.asarray(self.graph.kind), (LOOP, POSITION)).any())
+
     def corrected(self, params: GlobalParams) -> Float[Array, "n 7"]:
         """Return the corrected poses T_world_imu: quaternion w, x, y, z and translation, m.
 
         Call it outside of ``jit``, because the host finds the solution.
         """
         return _interpolated(self, solved_poses(_weighted(self, params)))
+
+    def negative_log_evidence(self, params: GlobalParams) -> Float[Array, ""]:
+        """Return minus the log marginal likelihood of the graph's measurements, by Laplace's approximation.
+
+        At the poses of least cost it is ``cost - sum(log det Omega) / 2 + log det H / 2``, with the
+        information Omega of the edges and the Hessian H of the cost by the free poses (MacKay, "Information
+        theory, inference, and learning algorithms", 2003, chapter 27). H is that of Gauss-Newton, which has
+        no negative eigenvalue and is exact where measurements are linear in the poses. The derivative is that
+        of this number, H at the poses of least cost included. The prior of the poses is flat.
+
+        Left out is what no parameter changes: the powers of 2 pi, and log det Omega of the edges that keep
+        their weight. So only differences of this number have a meaning. It is NaN where H is not positive
+        definite. Call it outside of ``jit``, because the host finds the solution.
+        """
+        graph = _weighted(self, params)
+        poses = solved_poses(graph)
+        return _misfit(self.depends, graph, poses) + log_determinant(poses, graph) / 2
 
 
 def replayed_graph(
@@ -115,6 +139,17 @@ def _weighted(replayed: ReplayedGraph, params: GlobalParams) -> PoseGraph:
         information = jnp.where(mine, jnp.pad(inverse, ((0, 0), *[(6 - size, 0)] * 2)), information)
     lever = jnp.broadcast_to(gps.lever_arm, (len(graph.kind), 3)).astype(information.dtype)
     return eqx.tree_at(lambda graph: (graph.information, graph.lever), graph, (information, lever))
+
+
+@jax.jit
+def _misfit(depends: Bool[Array, " e"], graph: PoseGraph, poses: Poses) -> Float[Array, ""]:
+    """Return the cost less half of the log-determinants of the information that depends on parameters."""
+    # a position has no rows for the rotation
+    turns = jnp.arange(6) < 3
+    no_row = jnp.where((graph.kind == POSITION)[:, None] & turns, 1.0, 0.0)
+    information = graph.information + no_row[:, None] * jnp.eye(6)
+    log_det = jnp.linalg.slogdet(jnp.where(depends[:, None, None], information, jnp.eye(6)))[1]
+    return jnp.sum(edge_costs(poses, graph)) - jnp.sum(log_det) / 2
 
 
 @jax.jit

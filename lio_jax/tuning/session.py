@@ -17,7 +17,7 @@ from lio_jax.core.files import atomic_path
 from lio_jax.tuning.corrected import CorrectedLoss
 from lio_jax.tuning.evaluated import Evaluated
 from lio_jax.tuning.gradient import Loss
-from lio_jax.tuning.objectives import nothing_counts
+from lio_jax.tuning.objectives import nothing_counts, nothing_depends
 from lio_jax.tuning.optimise import Bounds, adam, fisher_scoring, lbfgsb, parameter_covariance, stationary
 from lio_jax.tuning.parameters import ParameterVector
 from lio_jax.tuning.recording import Recording
@@ -134,7 +134,7 @@ class Session:
 
         Raises:
             EarlyStop: it has not fallen for long.
-            LioJaxError: the very first value is not finite, or no scan depends on the parameters.
+            LioJaxError: the very first value is not finite, or does not depend on the parameters.
         """
         result = self._loss(x, recordings or self._training)
         if not self.history and not math.isfinite(result.value):
@@ -143,6 +143,8 @@ class Session:
             )
         if self._likelihood and not self.history and result.scores is not None and not result.scores.any():
             raise nothing_counts(result.scans)
+        if not self.history and not result.gradient.any():
+            raise nothing_depends(self._free.names)
         sigma = None
         if self._likelihood:
             variance = np.diag(parameter_covariance(result))
