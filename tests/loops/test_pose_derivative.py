@@ -7,7 +7,8 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.pose_graph.graph import POSITION, translations
+from lio_jax.pose_graph.factors import residuals
+from lio_jax.pose_graph.graph import POSITION, picked, translations
 from lio_jax.pose_graph.pose_derivative import solved_poses
 from lio_jax.pose_graph.pose_graph import Limits, solve
 from tests.loops.graphs import graph_of, walk, with_edges, with_poses
@@ -139,3 +140,21 @@ def with_edges_traced(graph, poses, information, lever=None):
 def test_values_are_those_of_the_solve(graph):
     expected = jax.tree.leaves(solve(graph, limits=Limits(tolerance=1e-14)).poses)[0]
     np.testing.assert_allclose(jax.tree.leaves(solved_poses(graph))[0], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(("scale", "largest"), [(1e7, 1e-3), (1e9, 1e-4)])
+def test_derivative_in_the_plane_where_residuals_are_small(scale, largest):
+    """A logarithm that cancels at small angles makes the exact Hessian wrong."""
+    rng = np.random.default_rng(6)
+    graph = graph_of(walk(jaxlie.SE2, 8, rng), [(0, 5), (2, 7)], rng, scale=scale)
+    r = residuals(picked(graph.poses, graph.i), picked(graph.poses, graph.j), graph)
+    assert largest / 10 < np.abs(np.asarray(r)).max() < 10 * largest
+    _, logs, _ = change_of(graph, 1)
+
+    def along(t):
+        weighted = graph.information * jnp.exp(t * logs)[:, None, None]
+        return loss(solved_poses(eqx.tree_at(lambda graph: graph.information, graph, weighted)))
+
+    # differences of fourth order, whose error is far below the tolerance
+    near, far = (float(along(step) - along(-step)) for step in (0.02, 0.04))
+    assert float(jax.grad(along)(0.0)) == pytest.approx((8 * near - far) / (12 * 0.02), rel=1e-6)
