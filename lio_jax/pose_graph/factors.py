@@ -16,7 +16,7 @@ from scipy.special import zeta
 
 from lio_jax.core.geometry import skew
 from lio_jax.core.xla import computed_once
-from lio_jax.pose_graph.graph import POSITION, PRIOR, PoseGraph, Poses, between, picked, rotation_first
+from lio_jax.pose_graph.graph import POSITION, PRIOR, PoseGraph, Poses, between, moved, picked, rotation_first
 
 _SERIES_BELOW = 0.3
 """Angle, rad, below which the closed forms of the coefficients cancel, so that their series are used."""
@@ -71,11 +71,7 @@ def linearise(poses: Poses, graph: PoseGraph) -> Linearised:
         graph: the graph of the edges.
     """
     T_world_i, T_world_j = computed_once((picked(poses, graph.i), picked(poses, graph.j)))
-    across = rotation_first(between(T_world_j, T_world_i).adjoint(), axes=2)
-    across = computed_once(jnp.where(_is_unary(graph)[:, None, None], 0.0, across))
-    r = computed_once(residuals(T_world_i, T_world_j, graph))
-    A_j = right_jacobian_inverse(r)
-    A_j = jnp.where((graph.kind == POSITION)[:, None, None], _position_slope(T_world_j, graph), A_j)
+    r, A_j, across = _slopes(T_world_i, T_world_j, graph)
     weighted_j, weighted_r = computed_once(
         (_product(graph.information, A_j), jnp.einsum("eij,ej->ei", graph.information, r))
     )
@@ -89,6 +85,69 @@ def linearise(poses: Poses, graph: PoseGraph) -> Linearised:
         g_i=-jnp.einsum("eji,ej->ei", across, g_j),
         g_j=g_j,
     )
+
+
+def gradient(poses: Poses, graph: PoseGraph) -> Float[Array, "n d"]:
+    """Return the gradient of the cost by right perturbations of the poses.
+
+    Args:
+        poses: (n,) T_world_vertex, m.
+        graph: the graph of the edges.
+    """
+    r, A_j, across = _slopes(picked(poses, graph.i), picked(poses, graph.j), graph)
+    g_j = jnp.einsum("eji,ejk,ek->ei", A_j, graph.information, r)
+    g_i = -jnp.einsum("eji,ej->ei", across, g_j)
+    return jnp.zeros((len(graph.fixed), g_j.shape[-1]), g_j.dtype).at[graph.i].add(g_i).at[graph.j].add(g_j)
+
+
+def edge_hessians(poses: Poses, graph: PoseGraph) -> Float[Array, "e h h"]:
+    """Return the second derivatives of each edge's cost by the steps of its first and second vertex.
+
+    They contain the second derivatives of the residual, which :func:`linearise` leaves out. Let Phi be the
+    Hessian by d_j. It is the symmetric part of the derivative of the gradient g_j at moved poses T exp(d_j).
+    With a = -Ad(T_j^-1 T_i) d_i, both steps change E to E exp(a) exp(d_j) = E exp(a + d_j + [a, d_j] / 2) up
+    to second order. So the other blocks follow from Phi, Ad and the bracket.
+
+    Args:
+        poses: (n,) T_world_vertex, m.
+        graph: the graph of the edges.
+
+    Returns:
+        The Hessians, h = 2 d: the d rows of the first vertex, then those of the second one.
+    """
+    T_world_j = picked(poses, graph.j)
+    r, A_j, across = _slopes(picked(poses, graph.i), T_world_j, graph)
+    size = r.shape[-1]
+    weighted_r = jnp.einsum("eij,ej->ei", graph.information, r)
+    g_j = jnp.einsum("eji,ej->ei", A_j, weighted_r)
+
+    def bend_along(direction: Float[Array, " d"]) -> Array:
+        """Return the change of g_j by that of A_j."""
+        step = jnp.broadcast_to(direction, r.shape)
+        of_log = jax.jvp(right_jacobian_inverse, (r,), (A_j @ direction,))[1]
+        of_position = jax.jvp(
+            lambda step: _position_slope(moved(T_world_j, step), graph), (jnp.zeros_like(r),), (step,)
+        )[1]
+        change = jnp.where((graph.kind == POSITION)[:, None, None], of_position, of_log)
+        return jnp.einsum("eji,ej->ei", change, weighted_r)
+
+    identity = jnp.eye(size, dtype=r.dtype)
+    bend = jax.vmap(bend_along, out_axes=-1)(identity)
+    H_jj = _product(_turned(A_j), _product(graph.information, A_j)) + (bend + _turned(bend)) / 2
+    bracket = jnp.einsum("ek,akb->eab", g_j, _ad(identity))
+    H_ij = -_product(_turned(across), H_jj + bracket / 2)
+    H_ii = _product(_turned(across), _product(H_jj, across))
+    return jnp.block([[H_ii, H_ij], [_turned(H_ij), H_jj]])
+
+
+def _slopes(T_world_i: Poses, T_world_j: Poses, graph: PoseGraph) -> tuple[Array, Array, Array]:
+    """Return residuals, their derivatives A by the second vertex, and Ad; those by the first are -A Ad."""
+    across = rotation_first(between(T_world_j, T_world_i).adjoint(), axes=2)
+    across = computed_once(jnp.where(_is_unary(graph)[:, None, None], 0.0, across))
+    r = computed_once(residuals(T_world_i, T_world_j, graph))
+    A_j = right_jacobian_inverse(r)
+    A_j = jnp.where((graph.kind == POSITION)[:, None, None], _position_slope(T_world_j, graph), A_j)
+    return r, A_j, across
 
 
 def right_jacobian_inverse(tangent: Float[Array, "e d"]) -> Float[Array, "e d d"]:
