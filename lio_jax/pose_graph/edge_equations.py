@@ -1,18 +1,19 @@
 """Symmetric linear systems of a pose graph, given as sums over its edges, within a compiled program.
 
-Small systems are solved as dense matrices. For larger ones the program calls the sparse factorisation on the
-host. A batch of systems, and any number of right-hand sides, are one call.
+The program calls the host, once for a batch of systems and any number of right-hand sides. Small systems are
+solved as dense matrices there, larger ones by the sparse factorisation. LAPACK within the program would do
+for small systems, but not on a busy machine: its threads then wait for each other, up to a hundred times as
+long as they work.
 """
 
 from functools import lru_cache
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import lapack
 
 from lio_jax.pose_graph.block_cholesky import factorise, solve
 from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError, one_thread
@@ -45,22 +46,8 @@ class EdgeEquations(NamedTuple):
         Args:
             right: right-hand side; the solution has the same values for held vertices.
         """
-        if right.size <= MOST_DENSE_ROWS:
-            solution = cho_solve(cho_factor(self._dense()), right.ravel().astype(float)).reshape(right.shape)
-            return solution.astype(right.dtype)
         shape = jax.ShapeDtypeStruct(right.shape, right.dtype)
         return jax.pure_callback(_solved_on_host, shape, *self, right, vmap_method="expand_dims")
-
-    def _dense(self) -> Float[Array, "r r"]:
-        count, size = self.diagonal.shape
-        blocks = self.blocks.reshape(-1, 2, size, 2, size).transpose(0, 1, 3, 2, 4).astype(float)
-        vertices = jnp.stack([self.i, self.j], -1)
-        H = jnp.zeros((count, count, size, size), blocks.dtype)
-        H = H.at[vertices[:, :, None], vertices[:, None, :]].add(blocks)
-        free = ~self.held
-        H = jnp.where((free[:, None] & free)[:, :, None, None], H, 0.0)
-        H = H.transpose(0, 2, 1, 3).reshape(count * size, count * size)
-        return H + jnp.diag(jnp.where(self.held[:, None], 1.0, self.diagonal).ravel())
 
 
 def _solved_on_host(
@@ -92,20 +79,37 @@ def _solved_columns(
     i: NDArray, j: NDArray, held: NDArray, blocks: NDArray, diagonal: NDArray, right: NDArray
 ) -> NDArray:
     """Return the (k, n, d) solutions of one system."""
+    columns = right.reshape(len(right), -1).T.astype(np.float64)
+    if len(columns) <= MOST_DENSE_ROWS:
+        _, solved, failed = lapack.dposv(_dense(i, j, held, blocks, diagonal), columns, lower=True)
+        return np.full_like(right, np.nan) if failed else solved.T.reshape(right.shape)
+    size = diagonal.shape[-1]
     edges = (vertex.astype(np.int64).tobytes() for vertex in (i, j))
-    structure = _structure(*edges, held.tobytes(), diagonal.shape[-1])
+    structure = _structure(*edges, held.tobytes(), size)
     solution = right.copy()
     if structure.count:
         of_vertices, of_pairs = blocks_of(structure, blocks)
-        rows = np.arange(diagonal.shape[-1])
-        of_vertices[:, rows, rows] += diagonal[~held]
-        columns = right[:, ~held].transpose(1, 2, 0).astype(np.float64)
+        of_vertices[:, np.arange(size), np.arange(size)] += diagonal[~held]
+        unknown = columns.reshape(len(held), size, -1)[~held]
         try:
-            solved = solve(factorise(structure.plan, of_vertices, of_pairs), columns)
+            solved = solve(factorise(structure.plan, of_vertices, of_pairs), unknown)
         except NotPositiveDefiniteError:
-            solved = np.full_like(columns, np.nan)
+            solved = np.full_like(unknown, np.nan)
         solution[:, ~held] = solved.transpose(2, 0, 1)
     return solution
+
+
+def _dense(i: NDArray, j: NDArray, held: NDArray, blocks: NDArray, diagonal: NDArray) -> NDArray[np.float64]:
+    count, size = diagonal.shape
+    H = np.zeros((count, size, count, size))
+    ends = np.stack([i, j], -1)
+    parts = blocks.reshape(-1, 2, size, 2, size).transpose(0, 1, 3, 2, 4)
+    np.add.at(H.transpose(0, 2, 1, 3), (ends[:, :, None], ends[:, None, :]), parts)
+    H[held] = 0
+    H[:, :, held] = 0
+    H = H.reshape(count * size, -1)
+    np.fill_diagonal(H, H.diagonal() + np.where(held[:, None], 1.0, diagonal).ravel())
+    return H
 
 
 def blocks_of(

@@ -68,7 +68,9 @@ _descended = jax.jit(lambda limits, graph, held: descended(graph, held, limits),
 
 
 @jax.jit
-def _after_newton_steps(unmoved: Float[Array, " u"], numbers: Array, inputs: tuple[PoseGraph, Array]) -> Poses:
+def _after_newton_steps(
+    unmoved: Float[Array, " u"], numbers: Array, inputs: tuple[PoseGraph, Array]
+) -> Poses:
     def stepped(_: int, numbers: Array) -> Array:
         step = _solve_hessian(unmoved, numbers, inputs, _gradient(unmoved, numbers, *inputs))
         return jax.tree.leaves(_poses_at(-step, numbers, *inputs))[0].astype(numbers.dtype)

@@ -51,10 +51,7 @@ class ReplayedGraph(eqx.Module):
     """Whether the height of the fixes is used."""
 
     def corrected(self, params: GlobalParams) -> Float[Array, "n 7"]:
-        """Return the corrected poses T_world_imu: quaternion w, x, y, z and translation, m.
-
-        Call it outside of ``jit``, because the host finds the solution.
-        """
+        """Return the corrected poses T_world_imu: quaternion w, x, y, z and translation, m."""
         return _interpolated(self, solved_poses(_weighted(self, params)))
 
 
