@@ -41,7 +41,8 @@ def solved_poses(graph: PoseGraph, limits: Limits = _STRICT) -> Poses:
             depend on the poses of vertices that are not held.
         limits: conditions that end the Gauss-Newton steps.
     """
-    held = held_vertices(graph) if is_traced(graph) else jax.device_put(structure_of(graph).held)
+    of_structure = (graph.i, graph.j, graph.kind, graph.fixed)
+    held = held_vertices(graph) if is_traced(of_structure) else jax.device_put(structure_of(graph).held)
     problem = Problem(
         solve=partial(_root, limits),
         probe=lambda step, numbers, inputs: (),
@@ -54,16 +55,13 @@ def solved_poses(graph: PoseGraph, limits: Limits = _STRICT) -> Poses:
 
 def _root(limits: Limits, inputs: tuple[PoseGraph, Array]) -> ImplicitSolution:
     graph, held = inputs
-    if is_traced(inputs):
-        poses = _descended(limits, graph, held)
-    else:
-        poses = solve(graph, limits=limits).poses
+    poses = _descended(limits, graph, held) if is_traced(inputs) else solve(graph, limits=limits).poses
     unmoved = jnp.zeros(len(graph.fixed) * graph.poses.tangent_dim, graph.information.dtype)
     poses = _after_newton_steps(unmoved, jax.tree.leaves(poses)[0], inputs)
     return ImplicitSolution(unmoved, jax.tree.leaves(poses)[0], poses)
 
 
-# compiled once for all calls under vmap outside of jit
+# kept, so that a call under vmap outside of jit is compiled once
 _descended = jax.jit(lambda limits, graph, held: descended(graph, held, limits), static_argnums=0)
 
 

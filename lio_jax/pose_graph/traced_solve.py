@@ -46,7 +46,7 @@ def held_vertices(graph: PoseGraph) -> Bool[Array, " n"]:
     return graph.fixed | ((first == own) & ~tied)
 
 
-def moved_unless(held: Bool[Array, " n"], poses: Poses, step: Float[Array, "n d"]) -> Poses:
+def _moved_unless(held: Bool[Array, " n"], poses: Poses, step: Float[Array, "n d"]) -> Poses:
     """Return T exp(step); held vertices keep their pose.
 
     Args:
@@ -116,7 +116,7 @@ def descended(graph: PoseGraph, held: Bool[Array, " n"], limits: Limits) -> Pose
 
     def tried(search: _Search) -> _Search:
         """Try the step, and choose the damping of the next one."""
-        poses = moved_unless(held, search.poses, search.step)
+        poses = _moved_unless(held, search.poses, search.step)
         parts = jax.tree.map(lambda part: part.astype(dtype), linearise(poses, graph))
         cost, damping, promised = jnp.sum(parts.cost), search.damping, search.promised
         gained = search.cost - cost

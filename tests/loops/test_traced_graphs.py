@@ -12,9 +12,8 @@ from lio_jax.pose_graph.graph import matrices_of, numbers_of
 from lio_jax.pose_graph.pose_derivative import solved_poses
 from lio_jax.pose_graph.structure import structure_of
 from lio_jax.pose_graph.traced_solve import held_vertices
-from tests.loops.graphs import graph_of, walk, with_edges, with_poses, with_priors_and_positions
+from tests.loops.graphs import graph_of, walk, with_poses, with_priors_and_positions
 
-GROUPS = [jaxlie.SE3, jaxlie.SE2]
 LEVER = (0.7, -0.4, 1.1)
 in_program = jax.jit(solved_poses)
 
@@ -56,11 +55,6 @@ def large(group):
 KINDS = {"loops": small, "measured": measured, "two parts": in_two_parts, "large": large}
 
 
-@pytest.fixture(params=GROUPS, ids=["space", "plane"])
-def group(request):
-    return request.param
-
-
 def weighted(graph, logs):
     information = graph.information * jnp.exp(logs)[:, None, None]
     return eqx.tree_at(lambda graph: graph.information, graph, information)
@@ -71,7 +65,17 @@ def loss(poses):
     return jnp.sum(jnp.sin(numbers) * jnp.arange(numbers.size).reshape(numbers.shape) / numbers.size)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("group", "kind"),
+    [
+        (jaxlie.SE3, "measured"),
+        (jaxlie.SE2, "two parts"),
+        (jaxlie.SE2, "large"),
+        pytest.param(jaxlie.SE3, "two parts", marks=pytest.mark.long),
+        pytest.param(jaxlie.SE3, "large", marks=pytest.mark.long),
+        pytest.param(jaxlie.SE2, "measured", marks=pytest.mark.long),
+    ],
+)
 def test_solution_is_that_of_the_host(group, kind):
     graph = KINDS[kind](group)
     np.testing.assert_allclose(matrices_of(in_program(graph)), matrices_of(solved_poses(graph)), atol=1e-9)
@@ -133,6 +137,7 @@ def test_gradient_in_a_program_is_that_outside_and_the_central_difference(kind):
         assert float(inside[k]) == pytest.approx((8 * near - far) / 12e-3, rel=1e-6, abs=1e-9)
 
 
+@pytest.mark.long
 def test_gradients_of_a_batch_in_space():
     graph = measured(jaxlie.SE3)
     logs = jnp.asarray(np.random.default_rng(1).normal(size=(3, len(graph.i))))
