@@ -2,8 +2,8 @@
 
     python experiments/bench/graph_batches.py [--sets 64] [--poses 24] [--repeats 5]
 
-The graph is in space, with two loops. The program is compiled before; its time is in the table. Both start
-from the same poses and use the same limits. "gradient" is that of a sum of the poses by all weights.
+The graph is in space, with two loops. The program is compiled before; its time is in the table. Both
+use the same limits. "gradient" is that of the sum of all positions by all weights.
 """
 
 import argparse
@@ -45,7 +45,7 @@ def main() -> None:
 
     def solved(logs: jax.Array) -> jax.Array:
         information = graph.information * jnp.exp(logs)[:, None, None]
-        return jax.tree.leaves(solved_poses(eqx.tree_at(lambda g: g.information, graph, information)))[0]
+        return solved_poses(eqx.tree_at(lambda g: g.information, graph, information)).translation()
 
     gradient = jax.grad(lambda logs: jnp.sum(solved(logs)))
     print(f"{'':10}{'compile':>9}{'batch':>16}{'one by one':>16}")
