@@ -50,28 +50,31 @@ class EdgeEquations(NamedTuple):
         return jax.pure_callback(_solved_on_host, shape, *self, right, vmap_method="expand_dims")
 
 
-def _solved_on_host(
-    i: ArrayLike, j: ArrayLike, held: ArrayLike, blocks: ArrayLike, diagonal: ArrayLike, right: ArrayLike
-) -> NDArray:
-    """Solve a batch of systems; axes along which only ``right`` varies are right-hand sides of one system."""
-    system = [np.asarray(each) for each in (i, j, held, blocks, diagonal)]
+def _solved_on_host(*arrays: ArrayLike) -> NDArray:
+    """Solve a batch of systems; axes along which only the last array varies are right-hand sides of one.
+
+    Args:
+        arrays: the fields of :class:`EdgeEquations`, then the right-hand sides, all with the axes of the
+            batch first; an axis along which an array does not vary has size 1.
+    """
+    *system, right = (np.asarray(each) for each in arrays)
     axes = [each.shape[: each.ndim - own] for each, own in zip(system, (1, 1, 1, 3, 2), strict=True)]
     batch = np.broadcast_shapes(*axes)
-    right = np.asarray(right)
     own = right.shape[-2:]
     right = np.broadcast_to(right, (*np.broadcast_shapes(batch, right.shape[:-2]), *own))
     solution = np.empty_like(right)
     with one_thread():
         for index in np.ndindex(batch):
-            picked = [
+            i, j, held, blocks, diagonal = (
                 each[tuple(number if size > 1 else 0 for number, size in zip(index, axes_of, strict=True))]
                 for each, axes_of in zip(system, axes, strict=True)
-            ]
+            )
             some = tuple(
                 number if size > 1 else slice(None) for number, size in zip(index, batch, strict=True)
             )
             columns = right[some]
-            solution[some] = _solved_columns(*picked, columns.reshape(-1, *own)).reshape(columns.shape)
+            solved = _solved_columns(i, j, held, blocks, diagonal, columns.reshape(-1, *own))
+            solution[some] = solved.reshape(columns.shape)
     return solution
 
 
@@ -107,9 +110,8 @@ def _dense(i: NDArray, j: NDArray, held: NDArray, blocks: NDArray, diagonal: NDA
     np.add.at(H.transpose(0, 2, 1, 3), (ends[:, :, None], ends[:, None, :]), parts)
     H[held] = 0
     H[:, :, held] = 0
-    H = H.reshape(count * size, -1)
-    np.fill_diagonal(H, H.diagonal() + np.where(held[:, None], 1.0, diagonal).ravel())
-    return H
+    added = np.diag(np.where(held[:, None], 1.0, diagonal).ravel())
+    return H.reshape(added.shape) + added
 
 
 def blocks_of(

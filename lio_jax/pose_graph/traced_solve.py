@@ -54,12 +54,7 @@ def _moved_unless(held: Bool[Array, " n"], poses: Poses, step: Float[Array, "n d
         poses: (n,) poses T, m.
         step: right perturbations, rotation (rad) before translation (m).
     """
-    return jax.tree.map(
-        # jaxlie may return doubles for single precision
-        lambda still, gone: jnp.where(held[:, None], still, gone.astype(still.dtype)),
-        poses,
-        moved(poses, step),
-    )
+    return jax.tree.map(lambda still, gone: jnp.where(held[:, None], still, gone), poses, moved(poses, step))
 
 
 class _Search(NamedTuple):
@@ -117,7 +112,7 @@ def descended(graph: PoseGraph, held: Bool[Array, " n"], limits: Limits) -> Pose
     def tried(search: _Search) -> _Search:
         """Try the step, and choose the damping of the next one."""
         poses = _moved_unless(held, search.poses, search.step)
-        parts = jax.tree.map(lambda part: part.astype(dtype), linearise(poses, graph))
+        parts = linearise(poses, graph)
         cost, damping, promised = jnp.sum(parts.cost), search.damping, search.promised
         gained = search.cost - cost
         # the factorisation of a singular matrix leaves no step
@@ -161,8 +156,12 @@ def descended(graph: PoseGraph, held: Bool[Array, " n"], limits: Limits) -> Pose
         solved=jnp.zeros((), int),
         ended=jnp.zeros((), bool),
     )
-    search = jax.lax.while_loop(lambda search: ~search.ended, lambda search: proposed(tried(search)), begin)
-    return search.poses
+
+    def after_a_step(search: _Search) -> _Search:
+        # jaxlie may return doubles for single precision
+        return jax.tree.map(lambda new, old: new.astype(old.dtype), proposed(tried(search)), search)
+
+    return jax.lax.while_loop(lambda search: ~search.ended, after_a_step, begin).poses
 
 
 def _diagonal(matrices: Float[Array, "e d d"]) -> Float[Array, "e d"]:

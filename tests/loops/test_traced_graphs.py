@@ -118,7 +118,7 @@ def test_graphs_with_other_edges_are_one_batch():
         np.testing.assert_allclose(ours, numbers_of(in_program(graph)), atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", ["loops", "large"])
+@pytest.mark.parametrize("kind", [pytest.param("loops", marks=pytest.mark.long), "large"])
 def test_gradient_in_a_program_is_that_outside_and_the_central_difference(kind):
     graph = KINDS[kind](jaxlie.SE2)
     logs = jnp.zeros(len(graph.i))
