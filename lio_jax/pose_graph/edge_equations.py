@@ -2,7 +2,7 @@
 
 The program calls the host, once for a batch of systems and any number of right-hand sides. Small systems are
 solved as dense matrices there, larger ones by the sparse factorisation. LAPACK within the program would do
-for small systems, but not on a busy machine: its threads then wait for each other, up to a hundred times as
+for small systems, but not on a busy machine: its threads then wait for each other, tens of times as
 long as they work.
 """
 

@@ -159,7 +159,10 @@ def descended(graph: PoseGraph, held: Bool[Array, " n"], limits: Limits) -> Pose
 
     def after_a_step(search: _Search) -> _Search:
         # jaxlie may return doubles for single precision
-        return jax.tree.map(lambda new, old: new.astype(old.dtype), proposed(tried(search)), search)
+        def at_its_precision(changed: _Search) -> _Search:
+            return jax.tree.map(lambda new, old: new.astype(old.dtype), changed, search)
+
+        return at_its_precision(proposed(at_its_precision(tried(search))))
 
     return jax.lax.while_loop(lambda search: ~search.ended, after_a_step, begin).poses
 
