@@ -184,13 +184,15 @@ def restricted(graph: PoseGraph, padded: Padded, used: NDArray[np.bool_]) -> tup
     return padded._replace(places=places_in(structure)), structure
 
 
-_LEAST_DAMPING, _LARGEST_DAMPING = 1e-10, 1e8
+LEAST_DAMPING, LARGEST_DAMPING = 1e-10, 1e8
 """Bounds of the damping, relative to the diagonal of the normal equations."""
-_FAITHFUL = 0.5
+LEAST_SCALE = 1e-6
+"""Least entry of the diagonal that the damping refers to, over the largest one."""
+FAITHFUL = 0.5
 """Least ratio of the actual to the predicted decrease of the cost after which the damping is reduced."""
-_ROUNDING = 1e-12
+ROUNDING = 1e-12
 """Relative change of the cost below which it may be a rounding error of the sum."""
-_NEGLIGIBLE_PER_EDGE = 1e-14
+NEGLIGIBLE_PER_EDGE = 1e-14
 """Decrease of the cost per edge that is only rounding where all edges agree."""
 
 
@@ -241,7 +243,7 @@ def descend(
     equations, failures = Equations.at(point, structure), 0
     while structure.count and iterations < limits.iterations:
         iterations += 1
-        negligible = limits.tolerance * cost + _NEGLIGIBLE_PER_EDGE * len(structure.i)
+        negligible = limits.tolerance * cost + NEGLIGIBLE_PER_EDGE * len(structure.i)
         try:
             step[: structure.count], promised = equations.solved(damping)
             tried = point_after(point.poses, jax.device_put(step), weights, padded)
@@ -254,14 +256,14 @@ def descend(
             if last or max(gained, promised) <= negligible:
                 return Descent(point, iterations, "converged")
             equations = Equations.at(point, structure)
-            if gained > _FAITHFUL * promised:
-                damping = damping / 10 if damping > _LEAST_DAMPING else 0.0
-        elif last or (promised >= 0 and max(promised, -gained) <= _ROUNDING * cost):
+            if gained > FAITHFUL * promised:
+                damping = damping / 10 if damping > LEAST_DAMPING else 0.0
+        elif last or (promised >= 0 and max(promised, -gained) <= ROUNDING * cost):
             return Descent(point, iterations, "converged")
         else:
             failures += 1
-            damping = max(damping, _LEAST_DAMPING) * 10.0**failures
-            if damping > _LARGEST_DAMPING:
+            damping = max(damping, LEAST_DAMPING) * 10.0**failures
+            if damping > LARGEST_DAMPING:
                 return Descent(point, iterations, "no further decrease")
     return Descent(point, iterations, "iteration limit" if structure.count else "converged")
 
@@ -301,7 +303,7 @@ class Equations:
             NotPositiveDefiniteError: H is numerically singular.
         """
         scale = np.diagonal(self.diagonal, axis1=1, axis2=2)
-        added = damping * np.maximum(scale, 1e-6 * scale.max(initial=0.0))
+        added = damping * np.maximum(scale, LEAST_SCALE * scale.max(initial=0.0))
         diagonal = self.diagonal
         if damping:
             diagonal = diagonal + added[:, :, None] * np.eye(added.shape[-1])

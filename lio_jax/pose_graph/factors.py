@@ -5,15 +5,18 @@ error of gtsam's BetweenFactor and PriorFactor, in space and in the plane. The p
 without the factor 1/2, and residuals that are not logarithms.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+from scipy.special import zeta
 
 from lio_jax.core.geometry import skew
 from lio_jax.core.xla import computed_once
-from lio_jax.pose_graph.graph import POSITION, PRIOR, PoseGraph, Poses, between, picked, rotation_first
+from lio_jax.pose_graph.graph import POSITION, PRIOR, PoseGraph, Poses, between, moved, picked, rotation_first
 
 _SERIES_BELOW = 0.3
 """Angle, rad, below which the closed forms of the coefficients cancel, so that their series are used."""
@@ -68,11 +71,7 @@ def linearise(poses: Poses, graph: PoseGraph) -> Linearised:
         graph: the graph of the edges.
     """
     T_world_i, T_world_j = computed_once((picked(poses, graph.i), picked(poses, graph.j)))
-    across = rotation_first(between(T_world_j, T_world_i).adjoint(), axes=2)
-    across = computed_once(jnp.where(_is_unary(graph)[:, None, None], 0.0, across))
-    r = computed_once(residuals(T_world_i, T_world_j, graph))
-    A_j = right_jacobian_inverse(r)
-    A_j = jnp.where((graph.kind == POSITION)[:, None, None], _position_slope(T_world_j, graph), A_j)
+    r, A_j, across = _slopes(T_world_i, T_world_j, graph)
     weighted_j, weighted_r = computed_once(
         (_product(graph.information, A_j), jnp.einsum("eij,ej->ei", graph.information, r))
     )
@@ -86,6 +85,69 @@ def linearise(poses: Poses, graph: PoseGraph) -> Linearised:
         g_i=-jnp.einsum("eji,ej->ei", across, g_j),
         g_j=g_j,
     )
+
+
+def gradient(poses: Poses, graph: PoseGraph) -> Float[Array, "n d"]:
+    """Return the gradient of the cost by right perturbations of the poses.
+
+    Args:
+        poses: (n,) T_world_vertex, m.
+        graph: the graph of the edges.
+    """
+    r, A_j, across = _slopes(picked(poses, graph.i), picked(poses, graph.j), graph)
+    g_j = jnp.einsum("eji,ejk,ek->ei", A_j, graph.information, r)
+    g_i = -jnp.einsum("eji,ej->ei", across, g_j)
+    return jnp.zeros((len(graph.fixed), g_j.shape[-1]), g_j.dtype).at[graph.i].add(g_i).at[graph.j].add(g_j)
+
+
+def edge_hessians(poses: Poses, graph: PoseGraph) -> Float[Array, "e h h"]:
+    """Return the second derivatives of each edge's cost by the steps of its first and second vertex.
+
+    They contain the second derivatives of the residual, which :func:`linearise` leaves out. Let Phi be the
+    Hessian by d_j. It is the symmetric part of the derivative of the gradient g_j at moved poses T exp(d_j).
+    With a = -Ad(T_j^-1 T_i) d_i, both steps change E to E exp(a) exp(d_j) = E exp(a + d_j + [a, d_j] / 2) up
+    to second order. So the other blocks follow from Phi, Ad and the bracket.
+
+    Args:
+        poses: (n,) T_world_vertex, m.
+        graph: the graph of the edges.
+
+    Returns:
+        The Hessians, h = 2 d: the d rows of the first vertex, then those of the second one.
+    """
+    T_world_j = picked(poses, graph.j)
+    r, A_j, across = _slopes(picked(poses, graph.i), T_world_j, graph)
+    size = r.shape[-1]
+    weighted_r = jnp.einsum("eij,ej->ei", graph.information, r)
+    g_j = jnp.einsum("eji,ej->ei", A_j, weighted_r)
+
+    def bend_along(direction: Float[Array, " d"]) -> Array:
+        """Return the change of g_j by that of A_j."""
+        step = jnp.broadcast_to(direction, r.shape)
+        of_log = jax.jvp(right_jacobian_inverse, (r,), (A_j @ direction,))[1]
+        of_position = jax.jvp(
+            lambda step: _position_slope(moved(T_world_j, step), graph), (jnp.zeros_like(r),), (step,)
+        )[1]
+        change = jnp.where((graph.kind == POSITION)[:, None, None], of_position, of_log)
+        return jnp.einsum("eji,ej->ei", change, weighted_r)
+
+    identity = jnp.eye(size, dtype=r.dtype)
+    bend = jax.vmap(bend_along, out_axes=-1)(identity)
+    H_jj = _product(_turned(A_j), _product(graph.information, A_j)) + (bend + _turned(bend)) / 2
+    bracket = jnp.einsum("ek,akb->eab", g_j, _ad(identity))
+    H_ij = -_product(_turned(across), H_jj + bracket / 2)
+    H_ii = _product(_turned(across), _product(H_jj, across))
+    return jnp.block([[H_ii, H_ij], [_turned(H_ij), H_jj]])
+
+
+def _slopes(T_world_i: Poses, T_world_j: Poses, graph: PoseGraph) -> tuple[Array, Array, Array]:
+    """Return residuals, their derivatives A by the second vertex, and Ad; those by the first are -A Ad."""
+    across = rotation_first(between(T_world_j, T_world_i).adjoint(), axes=2)
+    across = computed_once(jnp.where(_is_unary(graph)[:, None, None], 0.0, across))
+    r = computed_once(residuals(T_world_i, T_world_j, graph))
+    A_j = right_jacobian_inverse(r)
+    A_j = jnp.where((graph.kind == POSITION)[:, None, None], _position_slope(T_world_j, graph), A_j)
+    return r, A_j, across
 
 
 def right_jacobian_inverse(tangent: Float[Array, "e d"]) -> Float[Array, "e d d"]:
@@ -117,6 +179,67 @@ def right_jacobian_inverse(tangent: Float[Array, "e d"]) -> Float[Array, "e d d"
     return identity + ad / 2 + a[:, None, None] * ad2 + b[:, None, None] * ad4
 
 
+_NEAR_HALF_TANGENT = 0.02
+"""Squared tangent of half the angle below which the rotation vector is computed by its series."""
+_NEAR_ANGLE = 0.25
+"""Squared angle, rad^2, below which the inverse of the left Jacobian is computed by its series."""
+_ARCTANGENT = [(-1) ** n / (2 * n + 1) for n in range(12)]
+"""Coefficients of atan(x) / x by powers of x^2."""
+_COTANGENT = [float(2 * zeta(2 * n) / (2 * np.pi) ** (2 * n)) for n in range(1, 11)]
+"""Coefficients of (1 - x/2 cot(x/2)) / x^2 by powers of x^2 (Abramowitz & Stegun, 4.3.70 and 23.2.16)."""
+
+
+def logarithm(poses: Poses) -> Float[Array, "e d"]:
+    """Return the logarithms of (e,) poses, rotation (rad) before translation (m).
+
+    With the rotation vector w, the translation's part is J(w)^-1 t = t - w x t / 2 + k w x (w x t), where
+    k = (1 - x/2 cot(x/2)) / x^2 and x = |w| (Barfoot, "State estimation for robotics", 2017, section 7.1).
+    Values and the first three derivatives are accurate to rounding at small angles and at zero. Those of
+    jaxlie's logarithms are not: near an angle of 3e-5 rad, second derivatives in the plane have no correct
+    digit, and third derivatives in space are off by a tenth.
+
+    Args:
+        poses: (e,) poses, m; a rotation by half a turn has no unique logarithm.
+    """
+    (numbers,) = jax.tree.leaves(poses)
+    if poses.tangent_dim == 6:
+        turn, shift = _rotation_vector(numbers[:, :4]), numbers[:, 4:]
+        cross = skew(turn)
+        swept = jnp.sum(cross * shift[:, None, :], -1)
+        swept_twice = jnp.sum(cross * swept[:, None, :], -1)
+    else:
+        turn, shift = jnp.arctan2(numbers[:, 1], numbers[:, 0])[:, None], numbers[:, 2:]
+        swept = turn * jnp.stack([-shift[:, 1], shift[:, 0]], -1)
+        swept_twice = -(turn**2) * shift
+    squared = jnp.sum(turn**2, -1)
+    near = squared < _NEAR_ANGLE
+    half = jnp.sqrt(jnp.where(near, 1.0, squared)) / 2
+    k = (1 - half * jnp.cos(half) / jnp.sin(half)) / (4 * half**2)
+    k = jnp.where(near, _series(jnp.where(near, squared, 0.0), _COTANGENT), k)
+    return jnp.concatenate([turn, shift - swept / 2 + k[:, None] * swept_twice], -1)
+
+
+def _rotation_vector(wxyz: Float[Array, "e 4"]) -> Float[Array, "e 3"]:
+    """Return the rotation vectors, at most half a turn, of quaternions of any length above zero."""
+    w, v = wxyz[:, 0], wxyz[:, 1:]
+    squared = jnp.sum(v**2, -1)
+    near = squared < _NEAR_HALF_TANGENT * w**2
+    safe_w, length = jnp.where(near, w, 1.0), jnp.sqrt(jnp.where(near, 1.0, squared))
+    # q and -q are the same rotation
+    sign = jnp.where(w < 0, -1.0, 1.0)
+    factor = 2 * sign * jnp.arctan2(length, sign * w) / length
+    series = 2 / safe_w * _series(jnp.where(near, squared / safe_w**2, 0.0), _ARCTANGENT)
+    return jnp.where(near, series, factor)[:, None] * v
+
+
+def _series(x: Float[Array, " e"], coefficients: Sequence[float]) -> Float[Array, " e"]:
+    """Return the sum of coefficient n times x^n."""
+    total = jnp.full_like(x, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        total = total * x + coefficient
+    return total
+
+
 def _missed(T_i_j: Poses, T_world_j: Poses, graph: PoseGraph) -> Poses:
     """Return the error Z^-1 T_i_j of an edge between two vertices, Z^-1 T_world_j of one on one vertex."""
     alone = _is_unary(graph)[:, None]
@@ -131,7 +254,7 @@ def _residual(missed: Poses, T_world_j: Poses, graph: PoseGraph) -> Float[Array,
     off = point - graph.measurement.translation()
     rotates = missed.tangent_dim - off.shape[-1]
     position = jnp.pad(off, ((0, 0), (rotates, 0)))
-    return jnp.where((graph.kind == POSITION)[:, None], position, rotation_first(missed.log()))
+    return jnp.where((graph.kind == POSITION)[:, None], position, logarithm(missed))
 
 
 def _position_slope(T_world_j: Poses, graph: PoseGraph) -> Float[Array, "e d d"]:

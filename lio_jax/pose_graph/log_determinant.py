@@ -9,10 +9,10 @@ from scipy.linalg import solve_triangular
 
 from lio_jax.pose_graph import multifrontal
 from lio_jax.pose_graph.block_cholesky import ChainFactor, factorise
+from lio_jax.pose_graph.edge_equations import blocks_of
 from lio_jax.pose_graph.factors import linearise
 from lio_jax.pose_graph.graph import PoseGraph, Poses
 from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError, one_thread
-from lio_jax.pose_graph.pose_derivative import hessian_blocks
 from lio_jax.pose_graph.structure import structure_from, structure_of
 
 _Array = NDArray[np.float64]
@@ -79,7 +79,7 @@ def _on_host(
         return np.zeros((), dtype), np.zeros(edges.shape, dtype)
     try:
         with one_thread():
-            factor = factorise(structure.plan, *hessian_blocks(structure, edges))
+            factor = factorise(structure.plan, *blocks_of(structure, edges))
             diagonal, pairs = inverse_blocks(factor)
     except NotPositiveDefiniteError:
         return np.full((), np.nan, dtype), np.full(edges.shape, np.nan, dtype)

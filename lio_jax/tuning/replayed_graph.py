@@ -58,10 +58,7 @@ class ReplayedGraph(eqx.Module):
         return bool(np.isin(np.asarray(self.graph.kind), (LOOP, POSITION)).any())
 
     def corrected(self, params: GlobalParams) -> Float[Array, "n 7"]:
-        """Return the corrected poses T_world_imu: quaternion w, x, y, z and translation, m.
-
-        Call it outside of ``jit``, because the host finds the solution.
-        """
+        """Return the corrected poses T_world_imu: quaternion w, x, y, z and translation, m."""
         return _interpolated(self, solved_poses(_weighted(self, params)))
 
     def negative_log_evidence(self, params: GlobalParams) -> Float[Array, ""]:

@@ -7,10 +7,11 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.pose_graph.graph import POSITION, translations
+from lio_jax.pose_graph.factors import edge_hessians, residuals
+from lio_jax.pose_graph.graph import POSITION, moved, picked, translations
 from lio_jax.pose_graph.pose_derivative import solved_poses
 from lio_jax.pose_graph.pose_graph import Limits, solve
-from tests.loops.graphs import graph_of, walk, with_edges, with_poses
+from tests.loops.graphs import graph_of, walk, with_edges, with_poses, with_priors_and_positions
 
 STEP = 1e-5
 
@@ -139,3 +140,45 @@ def with_edges_traced(graph, poses, information, lever=None):
 def test_values_are_those_of_the_solve(graph):
     expected = jax.tree.leaves(solve(graph, limits=Limits(tolerance=1e-14)).poses)[0]
     np.testing.assert_allclose(jax.tree.leaves(solved_poses(graph))[0], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(("scale", "largest"), [(1e7, 1e-3), (1e9, 1e-4)])
+def test_derivative_in_the_plane_where_residuals_are_small(scale, largest):
+    """A logarithm that cancels at small angles makes the exact Hessian wrong."""
+    rng = np.random.default_rng(6)
+    graph = graph_of(walk(jaxlie.SE2, 8, rng), [(0, 5), (2, 7)], rng, scale=scale)
+    r = residuals(picked(graph.poses, graph.i), picked(graph.poses, graph.j), graph)
+    assert largest / 10 < np.abs(np.asarray(r)).max() < 10 * largest
+    _, logs, _ = change_of(graph, 1)
+
+    def along(t):
+        weighted = graph.information * jnp.exp(t * logs)[:, None, None]
+        return loss(solved_poses(eqx.tree_at(lambda graph: graph.information, graph, weighted)))
+
+    # differences of fourth order, whose error is far below the tolerance
+    near, far = (float(along(step) - along(-step)) for step in (0.02, 0.04))
+    assert float(jax.grad(along)(0.0)) == pytest.approx((8 * near - far) / (12 * 0.02), rel=1e-6)
+
+
+@pytest.mark.parametrize("group", [jaxlie.SE3, jaxlie.SE2], ids=["space", "plane"])
+def test_hessians_of_edges_are_second_differences(group):
+    rng = np.random.default_rng(5)
+    graph = graph_of(walk(group, 8, rng), [(0, 5), (2, 7)], rng, noise=5.0, scale=30.0)
+    lever = (0.7, -0.4, 1.1)[: 3 if group is jaxlie.SE3 else 2]
+    graph = with_priors_and_positions(graph, rng, priors=(4,), positions=(3, 6), lever=lever)
+    size = group.tangent_dim
+    T_world_i, T_world_j = picked(graph.poses, graph.i), picked(graph.poses, graph.j)
+
+    @jax.jit
+    def costs(steps):
+        r = residuals(moved(T_world_i, steps[:, :size]), moved(T_world_j, steps[:, size:]), graph)
+        return jnp.einsum("ei,eij,ej->e", r, graph.information, r) / 2
+
+    hessians = jax.jit(edge_hessians)(graph.poses, graph)
+    step = 3e-3
+    for _ in range(4):
+        along = jnp.asarray(rng.normal(size=(len(graph.i), 2 * size)))
+        far, near, here = (costs(k * step * along) + costs(-k * step * along) for k in (2, 1, 0))
+        expected = (16 * near - far - 15 * here) / (12 * step**2)
+        ours = jnp.einsum("ei,eij,ej->e", along, hessians, along)
+        np.testing.assert_allclose(ours, expected, rtol=1e-6, atol=1e-5)
