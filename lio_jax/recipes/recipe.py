@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar, runtime_c
 
 import equinox as eqx
 import jax.numpy as jnp
+import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.types import ImuBatch, NavState, Scan
@@ -134,6 +135,22 @@ class PagingRecipe(Protocol):
 
     def with_page(self, params: Any, state: Any, page: Page) -> Any:
         """Return a state with a keyframe that comes back; ``state`` is consumed."""
+        ...
+
+
+@runtime_checkable
+class CorrectingRecipe(Protocol):
+    """A recipe whose state can follow a correction of its keyframes."""
+
+    def corrected(self, params: Any, state: Any, T_new_old: jaxlie.SE3, keyframes: jaxlie.SE3) -> Any:
+        """Return a state whose world and keyframes have moved; ``state`` is consumed.
+
+        Args:
+            params: traced.
+            state: after a scan.
+            T_new_old: moves the vehicle, m; its rotation is about the vertical.
+            keyframes: new T_world_lidar of the rows of :class:`KeyframeTable`, m.
+        """
         ...
 
 
