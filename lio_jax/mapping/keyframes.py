@@ -9,7 +9,7 @@ import dataclasses
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float, Float32, Int32
+from jaxtyping import Array, Bool, Float, Float32, Int, Int32
 
 from lio_jax.core.xla import computed_once
 from lio_jax.mapping.params import SubmapParams
@@ -228,7 +228,7 @@ def next_to_enter(
 
 
 def keyframe_at(
-    keyframes: Keyframes, row: Int32[Array, ""], there: Bool[Array, ""] | bool = True
+    keyframes: Keyframes, row: Int[Array, ""], there: Bool[Array, ""] | bool = True
 ) -> tuple[jaxlie.SE3, KeyframeCloud]:
     """Return the pose and the points of the keyframe in a row.
 
