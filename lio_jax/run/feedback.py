@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 
 from lio_jax.core.geometry import rotation_matrix
 from lio_jax.core.xla import programs
-from lio_jax.data.trajectory import pose_matrices
 from lio_jax.loops.back_end import Correction, corrected_poses, levelled_onto
 from lio_jax.recipes.recipe import CorrectingRecipe, Output
 from lio_jax.run.paging import KeyframePager
@@ -84,7 +83,7 @@ class Feedback:
         assert table is not None
         self._rows = np.asarray(table.numbers)
         if int(table.added) >= 0:
-            T_map_lidar = _matrices(output.registration.T_world_lidar.wxyz_xyz)
+            T_map_lidar = np.asarray(output.registration.T_world_lidar.as_matrix())
             self._stamps_ns.append(stamp_ns)
             self._T_odom_lidar.append(np.linalg.inv(self._T_map_odom) @ T_map_lidar)
 
@@ -148,8 +147,3 @@ def _in_frame(T_new_old: jaxlie.SE3, places: tuple[Any, ...]) -> tuple[Any, ...]
         T_new_old @ origin,
         points @ turn.T.astype(points.dtype),
     )
-
-
-def _matrices(wxyz_xyz: Any) -> NDArray[np.float64]:
-    row = np.asarray(wxyz_xyz, np.float64)[None]
-    return pose_matrices(row[:, 4:], row[:, [1, 2, 3, 0]])[0]
