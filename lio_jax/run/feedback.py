@@ -112,13 +112,19 @@ class Feedback:
         rows = jaxlie.SE3(jnp.asarray(poses[self._rows]))
         return None if state is None else self._program(self._params, state, T_new_old, rows)
 
-    def in_odometry(self, nav: _Nav, output: Output) -> tuple[_Nav, Output]:
-        """Return the result of the last scan in the frame *odom*; the leaves that change are numpy arrays."""
-        if not self._scans or np.array_equal(self._T_map_odom, np.eye(4)):
-            return nav, output
+    def in_odometry(self, nav: _Nav, output: Output) -> tuple[NDArray[np.float64], _Nav, Output]:
+        """Return ``T_map_odom``, (4, 4) m, and the result of the last scan in the frame *odom*.
+
+        Args:
+            nav: after the scan, in the frame *map*.
+            output: likewise; the leaves that change become numpy arrays.
+        """
+        if np.array_equal(self._T_map_odom, np.eye(4)):
+            return self._T_map_odom, nav, output
         T_odom_map = jaxlie.SE3.from_matrix(jnp.asarray(np.linalg.inv(self._T_map_odom)))
         moved = _in_frame(T_odom_map, _places(nav, output))
-        return eqx.tree_at(lambda both: _places(*both), (nav, output), jax.tree.map(np.array, moved))
+        both = eqx.tree_at(lambda both: _places(*both), (nav, output), jax.tree.map(np.array, moved))
+        return self._T_map_odom, *both
 
     def _due(self, scan: int) -> Correction | None:
         """Return the correction to be applied before a scan, if there is a new one."""

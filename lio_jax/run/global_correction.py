@@ -183,12 +183,15 @@ class GlobalCorrection(Sink):
         self._picker, self._store = KeyframePicker(settings), KeyframeWriter(out)
         self._thread = BackEndThread(BackEnd(settings, self._closer, gate), feedback is not None)
         self._feedback = feedback
+        self._T_map_odom: list[NDArray[np.float64]] = []
         if feedback is not None:
             feedback.follow(self._thread.correction_after)
 
     def take(self, result: ScanResult) -> None:
         """Take the next scan's result; this never waits for the back end."""
         keyframe = self._picker(result)
+        if result.T_map_odom is not None:
+            self._T_map_odom.append(result.T_map_odom)
         if keyframe is not None:
             if self._feedback is not None:
                 self._feedback.add_keyframe(result.index)
@@ -212,6 +215,10 @@ class GlobalCorrection(Sink):
         self._store.finish(*self._of_all_stored(found, odometry, poses))
         with atomic_path(self._out / "odometry.tum") as aside:
             write_tum(aside, odometry)
+        if self._feedback is not None:
+            online = Trajectory(odometry.stamp_ns, np.array(self._T_map_odom) @ odometry.poses)
+            with atomic_path(self._out / "online.tum") as aside:
+                write_tum(aside, online)
         write_graph(self._out / "keyframes.g2o", _graph(found), np.arange(len(found.stamp_ns)))
         write_json(self._out / "loops.json", {"loops": [_loop(found, *one) for one in found.loops]})
         if found.T_enu_world is not None:

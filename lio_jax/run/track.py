@@ -63,6 +63,9 @@ class ScanResult:
     """The outage after which a new piece of map begins with this scan."""
     raw: NDArray[np.float32] | None = None
     """(k, 3) some of the points as recorded, m in the lidar frame of their own firing, for pictures."""
+    T_map_odom: NDArray[np.float64] | None = None
+    """(4, 4) pose of the odometry's world in the corrected map that the scan was matched with, m; None
+    without feedback."""
 
 
 class Compiled:
@@ -172,13 +175,15 @@ def track(
     # closing: whoever stops early must not leave the decoding thread and its files behind
     with ThreadPoolExecutor(1) as reader, closing(scan_inputs(settings, scans, imu)) as inputs:
         for fed, nav, output, step_ms in journal.replayed(step, inputs) if journal else ():
+            T_map_odom = None
             if feedback is not None:
                 feedback.applied(None, fed.index, pager)
                 feedback.take(fed.end_ns, output)
             if pager is not None:
                 pager.take(output)
-            nav, output = feedback.in_odometry(nav, output) if feedback else (nav, output)
-            yield judged(fed, nav, output.registration, output, step_ms)
+            if feedback is not None:
+                T_map_odom, nav, output = feedback.in_odometry(nav, output)
+            yield judged(fed, nav, output.registration, output, step_ms, T_map_odom)
         compiled_s = step.compile_s
         try:
             for fed, state, output in run_steps(
@@ -193,10 +198,12 @@ def track(
                 step_ms = (read_at - fed.begun_at - compiled_in_step_s) * 1e3
                 if journal is not None:
                     journal.add(fed, nav, output, step_ms, state if fed.usable else None)
+                T_map_odom = None
                 if feedback is not None:
-                    nav, output = feedback.in_odometry(nav, replace(output, registration=registration))
+                    output = replace(output, registration=registration)
+                    T_map_odom, nav, output = feedback.in_odometry(nav, output)
                     registration = output.registration
-                held = fed, nav, registration, output, step_ms
+                held = fed, nav, registration, output, step_ms, T_map_odom
         except (KeyboardInterrupt, Exception):
             if held is not None:
                 yield judged(*held)
@@ -221,7 +228,13 @@ class ResultBuilder:
         self._outages = OutageWatch()
 
     def __call__(
-        self, fed: ScanInput, nav: Any, registration: Any, output: Any, step_ms: float
+        self,
+        fed: ScanInput,
+        nav: Any,
+        registration: Any,
+        output: Any,
+        step_ms: float,
+        T_map_odom: NDArray[np.float64] | None = None,
     ) -> ScanResult:
         """Return the result of a scan; ``nav`` and ``registration`` have numpy leaves."""
         evidence = ScanEvidence(
@@ -259,6 +272,7 @@ class ResultBuilder:
             has_imu=fed.imu is not None,
             outage=self._outages(fed.end_ns, evidence, output.covariance),
             raw=_some(np.asarray(fed.scan.points)[: fed.count]),
+            T_map_odom=T_map_odom,
         )
 
 

@@ -14,14 +14,21 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import UsageError
-from lio_jax.data.trajectory import read_tum
+from lio_jax.data.sequence import ImuData
+from lio_jax.data.trajectory import Trajectory, read_tum
+from lio_jax.evaluation.trajectory_error import align, position_errors
 from lio_jax.loops.back_end import BackEnd
 from lio_jax.run.feedback import DELAY, Feedback
 from lio_jax.run.global_correction import BackEndThread
 from lio_jax.run.run import run_sequence, settings_for
 from lio_jax.settings.settings import Settings, recipe_settings, with_overrides
+from lio_jax.sim.blocks import LANE, PITCH, lap
+from lio_jax.sim.imu import ImuModel
+from lio_jax.sim.sequence import EPOCH_NS, SimulatedSequence, build
+from tests.experiments import bench_path  # noqa: F401
 from tests.run import inertial_drive
 from tests.run.inertial_drive import InertialReplay
+from tests.run.small_drive import without_points
 from tests.run.test_resume import contents, killed_at, resumable
 
 COUNT = 12
@@ -151,7 +158,8 @@ def test_the_odometry_does_not_jump():
     feedback, _, _, T_map_odom = fed_back(COUNT)
     assert np.linalg.norm(T_map_odom[:3, 3]) > 0.05
     T = odometry_poses()[-1]
-    nav, seen = feedback.in_odometry(*output_in_map(T_map_odom, T, COUNT - 1))
+    found, nav, seen = feedback.in_odometry(*output_in_map(T_map_odom, T, COUNT - 1))
+    np.testing.assert_allclose(found, T_map_odom, atol=1e-12)
     np.testing.assert_allclose(nav.T_world_imu.as_matrix(), T, atol=1e-12)
     np.testing.assert_allclose(nav.velocity, [1.0, 2.0, 0.5], atol=1e-12)
     np.testing.assert_allclose(seen.registration.T_world_lidar.as_matrix(), T @ LIFT, atol=1e-12)
@@ -256,3 +264,62 @@ def test_a_run_with_feedback_is_smooth_repeatable_and_resumable(tmp_path, bendin
     lengths = [np.linalg.norm(step[:, :3, 3], axis=1) for step in steps]
     assert lengths[1].max() < lengths[0].max() + 0.03
     np.testing.assert_allclose(steps[1][:, :3, 3], steps[0][:, :3, 3], atol=0.05)
+
+
+SPEED, PERIODS = 8.0, 240
+"""m/s; every second scan counts, so that there are five a second."""
+
+
+def lap_driven_again():
+    """Return a lap of 33 s around a block, driven on, and its truth.
+
+    No scan shows anything between 12.5 and 15.0 s, and there the gyroscope has an error of 0.15 rad/s.
+    """
+    scene = build("city", 0)
+    corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * PITCH - lap()[0]
+    path = rounded(corners, radius=9.0)
+    poses = driven(scene.world, np.tile(path, (2, 1)), -LANE)
+    way = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    stamps = EPOCH_NS + np.round(np.concatenate([[0.0], np.cumsum(way)]) / SPEED * 1e9).astype(np.int64)
+    drive = SimulatedSequence(
+        scene,
+        duration_s=0.2 * PERIODS,
+        beams=16,
+        columns=512,
+        imu=ImuModel(),
+        trajectory=Trajectory(stamps, poses),
+    )
+    samples, scans = drive.imu(), [next(drive.scans(number, 1)) for number in range(1, 2 * PERIODS, 2)]
+    scans = [without_points(one) if 12.5 < 0.2 * k + 0.1 < 15.0 else one for k, one in enumerate(scans)]
+    seconds = (samples.stamp_ns - EPOCH_NS) * 1e-9
+    gyro = samples.gyro + 0.15 * np.outer((seconds > 12.5) & (seconds < 15.0), [0.0, 0.0, 1.0])
+    return InertialReplay(scans, ImuData(samples.stamp_ns, gyro, samples.accel)), drive.truth()
+
+
+def late_error(trajectory, truth):
+    """Return the position error of the last 6 s, m, where the first 10 s lie on the truth."""
+    true = truth.at(trajectory.stamp_ns).poses
+    errors = position_errors(align(trajectory.poses[:50], true[:50]), trajectory.poses, true)
+    return float(np.sqrt(np.mean(errors[-30:] ** 2)))
+
+
+@pytest.mark.long
+def test_a_lap_driven_again_is_driven_in_its_old_map(tmp_path):
+    recording, truth = lap_driven_again()
+    wanted = [
+        "config.backend.loops=true",
+        "config.backend.feedback=true",
+        "config.output.keyframe_distance=3",
+        "config.output.map=false",
+        "params.loop.time_gap=15",
+    ]
+    settings, _ = settings_for(recording, with_overrides(recipe_settings("lio_sam"), wanted))
+    result = run_sequence(recording, settings, tmp_path)
+    assert result.interruption is None
+    odometry, online = (read_tum(tmp_path / f"{name}.tum") for name in ("odometry", "online"))
+    assert late_error(odometry, truth) > 5
+    assert late_error(online, truth) < 0.2 * late_error(odometry, truth)
+    steps = np.linalg.norm(np.diff(odometry.positions, axis=0), axis=1)
+    jumps = np.linalg.norm(np.diff(online.positions, axis=0), axis=1)
+    assert steps.max() < 0.2 * SPEED + 0.2
+    assert jumps.max() > 2
