@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
+from simulated_keyframes import driven, rounded
 
 from lio_jax.core.errors import UsageError
 from lio_jax.data.sequence import ImuData
@@ -25,7 +26,6 @@ from lio_jax.settings.settings import Settings, recipe_settings, with_overrides
 from lio_jax.sim.blocks import LANE, PITCH, lap
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import EPOCH_NS, SimulatedSequence, build
-from tests.experiments import bench_path  # noqa: F401
 from tests.run import inertial_drive
 from tests.run.inertial_drive import InertialReplay
 from tests.run.small_drive import without_points
