@@ -7,8 +7,8 @@ import time
 from importlib.metadata import version
 from pathlib import Path
 
-# The older emitters compile a quarter faster; lio_jax.core.xla compiles the runner's programs by them too. Later
-# versions have no such flag, and an unknown flag ends the process.
+# The older emitters compile a quarter faster; lio_jax.core.xla compiles the runner's programs by them too.
+# Later versions have no such flag, and an unknown flag ends the process.
 if version("jaxlib").startswith("0.10."):
     os.environ.setdefault(
         "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=true --xla_cpu_use_fusion_emitters=false"

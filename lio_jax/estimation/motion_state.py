@@ -46,6 +46,15 @@ class MotionState(eqx.Module):
             accel_bias=self.accel_bias + error[..., ACCEL_BIAS],
         )
 
+    def moved_by(self, T_new_old: jaxlie.SE3) -> "MotionState":
+        """Return the state in another world frame; a batch has one transformation for all rows."""
+        return MotionState(
+            T_world_imu=T_new_old @ self.T_world_imu,
+            velocity=T_new_old.rotation() @ self.velocity,
+            gyro_bias=self.gyro_bias,
+            accel_bias=self.accel_bias,
+        )
+
     def local(self, other: "MotionState") -> Float[Array, "*b 15"]:
         """Return the error for which ``self.retract(error) == other``."""
         back = jnp.swapaxes(rotation_matrix(self.T_world_imu.rotation()), -1, -2)

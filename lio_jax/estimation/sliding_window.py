@@ -193,6 +193,25 @@ def forget_oldest(window: Window) -> Window:
     return Window(fewer, jax.tree.map(_moved_up, window.states))
 
 
+def moved_by(window: Window, T_new_old: jaxlie.SE3) -> Window:
+    """Return the window in another world frame with the same vertical.
+
+    Information and covariances refer to right perturbations, and preintegrated samples to the IMU, so they
+    stay as they are.
+
+    Args:
+        window: without GPS positions.
+        T_new_old: from the old frame to the new one, m; its rotation is about the vertical, so gravity stays.
+    """
+    chain = window.chain
+    chain = eqx.tree_at(
+        lambda chain: (chain.prior.origin, chain.lidar.T_world_imu),
+        chain,
+        (chain.prior.origin.moved_by(T_new_old), T_new_old @ chain.lidar.T_world_imu),
+    )
+    return Window(chain, window.states.moved_by(T_new_old))
+
+
 def _moved_up(rows: Array) -> Array:
     return jnp.concatenate([rows[1:], rows[-1:]])
 

@@ -293,6 +293,8 @@ class BackEnd:
         self._unsolved = 0
         """Number of loops and fixes that entered the graph after the last solve."""
         self._solved_at = 0
+        self.solves = 0
+        """Number of solves of the graph so far."""
 
     def add(self, keyframe: Keyframe) -> None:
         """Add the next keyframe with its loops and its fix, and solve the graph if that is due."""
@@ -389,6 +391,7 @@ class BackEnd:
         found: Solved = solved(self._poses, self._edges)
         self._poses, self._weights = found.poses, found.weights
         self._unsolved, self._solved_at = 0, len(self._keyframes)
+        self.solves += 1
 
     def _outcomes(self, weights: _Array) -> list[tuple[Verdict, float | None]]:
         if self._closer is None:

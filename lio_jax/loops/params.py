@@ -132,6 +132,9 @@ class BackendConfig:
     """Tie the trajectory to the recording's GPS fixes."""
     gps_elevation: bool = static(True)
     """Use the height of the fixes; false: the height is the odometry's."""
+    feedback: bool = static(False)
+    """Move the keyframes that scans are matched with to their corrected poses, and the odometry's state with
+    them; only in the recipe lio_sam."""
 
 
 @dataclass(frozen=True)

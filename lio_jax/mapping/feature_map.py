@@ -10,7 +10,14 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from lio_jax.mapping.frame import Frame
-from lio_jax.mapping.keyframes import KeyframeCloud, Keyframes, next_to_enter, with_keyframe
+from lio_jax.mapping.keyframes import (
+    KeyframeCloud,
+    Keyframes,
+    keyframe_at,
+    next_to_enter,
+    with_keyframe,
+    with_poses,
+)
 from lio_jax.mapping.params import CubeGridParams, CubeParams, FeatureMapParams, PointMapParams, SubmapParams
 from lio_jax.mapping.point_map import (
     EDGE,
@@ -232,6 +239,18 @@ def with_scan(
         surface=jnp.concatenate([placed.surface, entering.surface]),
         surface_mask=jnp.concatenate([placed.surface_mask & keep, entering.surface_mask]),
     )
+    features, *added = _added_around(submap.features, both, frames, map_params, point_map)
+    return Submap(keyframes, features), frames, jax.lax.stop_gradient(placed), (added[0], added[1])
+
+
+def _added_around(
+    features: FeatureMap,
+    points: FeaturePoints,
+    frames: Frames,
+    map_params: FeatureMapParams,
+    point_map: CubeParams,
+) -> tuple[FeatureMap, PointInsertion, PointInsertion]:
+    """Return the map of the keyframes around with points added, its cube moved to the vehicle."""
     half_side = point_map.cube_side_length / 2
     margin = half_side / 2
 
@@ -239,7 +258,46 @@ def with_scan(
         in_blocks = (jnp.stack([half_side, margin]) / block).astype(jnp.float32)
         return move_cube(pmap, frame.anchor, in_blocks[0], in_blocks[1])
 
-    features, *added = added_to(
-        submap.features, both, jnp.array(True), frames, map_params, point_map, half_side, follow
+    return added_to(features, points, jnp.array(True), frames, map_params, point_map, half_side, follow)
+
+
+def rebuilt(
+    submap: Submap,
+    keyframes_T_world_lidar: jaxlie.SE3,
+    T_world_lidar: jaxlie.SE3,
+    time: Float[Array, ""],
+    map_params: FeatureMapParams,
+    point_map: CubeParams,
+    settings: SubmapParams,
+) -> Submap:
+    """Return the submap with its keyframes at other poses, and the map of their points built anew.
+
+    Args:
+        submap: donate it.
+        keyframes_T_world_lidar: new poses of the k rows, m.
+        T_world_lidar: current pose, in the same frame.
+        time: current time, s, on the keyframes' clock.
+        map_params: for the voxel sizes.
+        point_map: for the side of the box around the vehicle and ``nearer_by``.
+        settings: which keyframes the map holds.
+    """
+    keyframes = with_poses(submap.keyframes, keyframes_T_world_lidar, T_world_lidar, time, settings)
+    frames = frames_at(T_world_lidar.translation(), map_params)
+    block, point = submap.features.corner.block, submap.features.corner.point
+    empty = empty_feature_map(len(block), point.dtype)
+    empty = eqx.tree_at(
+        lambda both: (both.corner.cube, both.surface.cube),
+        empty,
+        (frames.corner.anchor, frames.surface.anchor),
     )
-    return Submap(keyframes, features), frames, jax.lax.stop_gradient(placed), (added[0], added[1])
+    # in the order in which the map met them
+    order = jnp.argsort(jnp.where(keyframes.entered, keyframes.time, jnp.inf))
+
+    def with_one(number: Array, features: FeatureMap) -> FeatureMap:
+        T_world_one, cloud = keyframe_at(keyframes, order[number])
+        points = FeaturePoints(cloud.corner, cloud.corner_mask, cloud.surface, cloud.surface_mask)
+        placed = placed_in(frames, points, T_world_one)
+        return _added_around(features, placed, frames, map_params, point_map)[0]
+
+    count = jnp.sum(keyframes.entered, dtype=jnp.int32)
+    return Submap(keyframes, jax.lax.fori_loop(0, count, with_one, empty))

@@ -9,7 +9,7 @@ import dataclasses
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float, Float32, Int32
+from jaxtyping import Array, Bool, Float, Float32, Int, Int32
 
 from lio_jax.core.xla import computed_once
 from lio_jax.mapping.params import SubmapParams
@@ -223,6 +223,20 @@ def next_to_enter(
     row = jnp.argmin(jnp.where(wanted, distance, jnp.inf))
     there = wanted[row]
     entered = entered.at[jnp.where(there, row, capacity)].set(True, mode="drop")
+    pose, cloud = keyframe_at(keyframes, row, there)
+    return eqx.tree_at(lambda k: k.entered, keyframes, entered), pose, cloud
+
+
+def keyframe_at(
+    keyframes: Keyframes, row: Int[Array, ""], there: Bool[Array, ""] | bool = True
+) -> tuple[jaxlie.SE3, KeyframeCloud]:
+    """Return the pose and the points of the keyframe in a row.
+
+    Args:
+        keyframes: all that have a row.
+        row: of the keyframe.
+        there: False: all points are masked.
+    """
     corner, surface = keyframes.corner[row], keyframes.surface[row]
     cloud = KeyframeCloud(
         corner=corner,
@@ -230,8 +244,31 @@ def next_to_enter(
         surface=surface,
         surface_mask=there & (jnp.arange(len(surface)) < keyframes.surfaces[row]),
     )
-    pose = jaxlie.SE3(keyframes.T_world_lidar.wxyz_xyz[row])
-    return eqx.tree_at(lambda k: k.entered, keyframes, entered), pose, cloud
+    return jaxlie.SE3(keyframes.T_world_lidar.wxyz_xyz[row]), cloud
+
+
+def with_poses(
+    keyframes: Keyframes,
+    T_world_lidar: jaxlie.SE3,
+    here: jaxlie.SE3,
+    time: Float[Array, ""],
+    params: SubmapParams,
+) -> Keyframes:
+    """Return the keyframes at other poses; those that a new map should hold count as entered.
+
+    These are the sparse ones within the radius, and the recent ones.
+
+    Args:
+        keyframes: all that have a row; donate them.
+        T_world_lidar: new poses of the k rows, m.
+        here: current pose, in the same frame.
+        time: current time, s.
+        params: ``radius`` (m) and the age ``recent`` (s).
+    """
+    moved = dataclasses.replace(keyframes, T_world_lidar=T_world_lidar)
+    near = moved.sparse & (_distance(moved, here) <= params.radius)
+    entered = ~_is_free(moved) & (near | (moved.time >= time - params.recent))
+    return dataclasses.replace(moved, entered=entered)
 
 
 _SPENT = 1e9

@@ -26,12 +26,12 @@ from lio_jax.core.geometry import from_blocks
 from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, ImuBatch, NavState, Scan, state_dtype
 from lio_jax.estimation.map_drift import MapDrift
 from lio_jax.estimation.motion_state import DOF
-from lio_jax.estimation.sliding_window import Window, log_evidence
+from lio_jax.estimation.sliding_window import Window, log_evidence, moved_by
 from lio_jax.estimation.smoother import Smoothed
 from lio_jax.lidar.features import (
     check_sizes,
 )
-from lio_jax.mapping.feature_map import Submap, empty_feature_map
+from lio_jax.mapping.feature_map import Submap, empty_feature_map, rebuilt
 from lio_jax.mapping.keyframes import Keyframes, Page, no_keyframes, with_page
 from lio_jax.recipes.inertial_filter import levelled_start, lidar_pose
 from lio_jax.recipes.lio_sam_params import LioSamConfig, LioSamParams
@@ -56,7 +56,7 @@ from lio_jax.recipes.smoothed_odometry import measured_attitude, opened
 
 
 class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
-    """LIO-SAM without its back end."""
+    """LIO-SAM; its back end is the runner's, whose corrections :meth:`corrected` takes over."""
 
     needs = Needs(imu="required", rings=True)
     config_type = LioSamConfig
@@ -174,6 +174,30 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
         here = lidar_pose(state.nav)
         keyframes = with_page(state.map.keyframes, page, here, params.submap)
         return eqx.tree_at(lambda some: some.map.keyframes, state, keyframes)
+
+    def corrected(
+        self, params: LioSamParams, state: LioSamState, T_new_old: jaxlie.SE3, keyframes: jaxlie.SE3
+    ) -> LioSamState:
+        """Return the state with corrected keyframes, as LIO-SAM's ``correctPoses`` leaves them.
+
+        The vehicle and the smoother's window move rigidly, the velocity turns with them, and gravity stays.
+        The map around the vehicle is built anew. Covariances stay: they refer to right perturbations.
+
+        Args:
+            params: traced.
+            state: after a scan; donate it.
+            T_new_old: moves the vehicle, m; its rotation is about the vertical.
+            keyframes: new T_world_lidar of the submap's k rows, m; those of free rows have no effect.
+        """
+        nav = dataclasses.replace(
+            state.nav,
+            T_world_imu=T_new_old @ state.nav.T_world_imu,
+            velocity=T_new_old.rotation() @ state.nav.velocity,
+        )
+        submap = rebuilt(
+            state.map, keyframes, lidar_pose(nav), state.time, params.map, params.point_map, params.submap
+        )
+        return dataclasses.replace(state, nav=nav, window=moved_by(state.window, T_new_old), map=submap)
 
 
 def _table(before: Keyframes, after: Keyframes, clock: Clock) -> KeyframeTable:

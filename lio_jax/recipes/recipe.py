@@ -167,6 +167,22 @@ class LocalisingRecipe(Protocol):
         ...
 
 
+@runtime_checkable
+class CorrectingRecipe(Protocol):
+    """A recipe whose state can follow a correction of its keyframes."""
+
+    def corrected(self, params: Any, state: Any, T_new_old: jaxlie.SE3, keyframes: jaxlie.SE3) -> Any:
+        """Return a state whose world and keyframes have moved; ``state`` is consumed.
+
+        Args:
+            params: traced.
+            state: after a scan.
+            T_new_old: moves the vehicle, m; its rotation is about the vertical.
+            keyframes: new T_world_lidar of the rows of :class:`KeyframeTable`, m.
+        """
+        ...
+
+
 _PLACED_ROTATION, _PLACED_POSITION = 0.01, 0.1
 """Standard deviations per axis of the pose at which a run begins in a known map, rad and m."""
 

@@ -61,6 +61,7 @@ RUN_FILES = (
     "trajectory.tum",
     "trajectory_kitti.txt",
     "odometry.tum",
+    "online.tum",
     "loops.json",
     "georeference.json",
     "imu_rate.tum",

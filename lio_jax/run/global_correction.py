@@ -1,10 +1,11 @@
 """The back end as a sink: it runs on a thread of its own and corrects the trajectory at the end."""
 
+import math
 import queue
 import tempfile
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from lio_jax.loops.gps import GpsGate
 from lio_jax.loops.keyframe import Keyframe, thinned
 from lio_jax.pose_graph.g2o import write_graph
 from lio_jax.pose_graph.graph import LOOP, ODOMETRY, PoseGraph
+from lio_jax.run.feedback import Feedback
 from lio_jax.run.folder import write_json
 from lio_jax.run.keyframes import KeyframePicker, KeyframeWriter, corner_marks, read_keyframes
 from lio_jax.run.map_file import TILES_PREFIX, MapTiles, read_cloud
@@ -35,13 +37,19 @@ from lio_jax.settings.settings import Settings
 class BackEndThread:
     """Hands keyframes to a back end, which takes them in order, one at a time."""
 
-    def __init__(self, back_end: BackEnd) -> None:
+    def __init__(self, back_end: BackEnd, keep_solved: bool = False) -> None:
         """Begin to wait for keyframes.
 
         Args:
             back_end: belongs to the thread until :meth:`finish`.
+            keep_solved: keep the correction by each solve for :meth:`correction_after`.
         """
         self._back_end = back_end
+        self._keep_solved = keep_solved
+        self._solved: deque[tuple[int, Correction]] = deque()
+        self._dealt_with: float = -1
+        """Number of the last keyframe that needs no more waiting; infinite once the work has ended."""
+        self._progress = threading.Condition()
         self._waiting: queue.SimpleQueue[Keyframe | None] = queue.SimpleQueue()
         self._stopped = threading.Event()
         self.error: Exception | None = None
@@ -55,6 +63,24 @@ class BackEndThread:
     def add(self, keyframe: Keyframe) -> None:
         """Hand over the next keyframe and return at once."""
         self._waiting.put(keyframe)
+
+    def correction_after(self, index: int) -> Correction | None:
+        """Return the correction by the last solve up to a keyframe; this waits for the keyframe.
+
+        What is returned depends on the keyframes alone, and not on the time that they take.
+
+        Args:
+            index: number of a keyframe that was handed over; it may not be smaller than in an earlier call.
+
+        Returns:
+            The correction; None where no solve has followed the correction that was returned last.
+        """
+        with self._progress:
+            self._progress.wait_for(lambda: self._dealt_with >= index)
+            found = None
+            while self._solved and self._solved[0][0] <= index:
+                found = self._solved.popleft()[1]
+            return found
 
     def finish(self, hurry: bool = False) -> Correction:
         """Return the correction of all keyframes; in a hurry, of those it has dealt with.
@@ -75,12 +101,23 @@ class BackEndThread:
     def _work(self) -> None:
         try:
             while (keyframe := self._waiting.get()) is not None and not self._stopped.is_set():
-                began = time.perf_counter()
+                began, solves = time.perf_counter(), self._back_end.solves
                 self._back_end.add(keyframe)
                 self.busy_s += time.perf_counter() - began
+                self._report(keyframe.index, self._back_end.solves > solves)
             self._back_end.settle()
         except Exception as error:
             self.error = error
+        finally:
+            self._report(math.inf, False)
+
+    def _report(self, index: float, is_solved: bool) -> None:
+        """Let a keyframe count as dealt with, and keep the correction if the graph was solved there."""
+        with self._progress:
+            if is_solved and self._keep_solved:
+                self._solved.append((int(index), self._back_end.correction()))
+            self._dealt_with = index
+            self._progress.notify_all()
 
 
 _LINES_NAMED = 5
@@ -114,7 +151,14 @@ def light(keyframe: Keyframe) -> Keyframe:
 class GlobalCorrection(Sink):
     """Corrects the trajectory and the map in a thread of its own, while the odometry goes on."""
 
-    def __init__(self, sequence: Sequence, settings: Settings, out: Path, files: StateFiles) -> None:
+    def __init__(
+        self,
+        sequence: Sequence,
+        settings: Settings,
+        out: Path,
+        files: StateFiles,
+        feedback: Feedback | None = None,
+    ) -> None:
         """Begin a back end for a run.
 
         Args:
@@ -122,6 +166,7 @@ class GlobalCorrection(Sink):
             settings: ``config.backend``, ``config.loops``, ``params.loop``, ``params.gps``.
             out: the run folder.
             files: those of the trajectory, which are written again as it is corrected; they finish before.
+            feedback: takes the corrections into the odometry; None: it goes on without them.
 
         Raises:
             LioJaxError: GPS is asked for and the recording holds none, or the file of pairs is damaged.
@@ -136,12 +181,20 @@ class GlobalCorrection(Sink):
         self._settings, self._out, self._files = settings, out, files
         self._origin = sequence.gps().origin if gate else None  # type: ignore[union-attr]
         self._picker, self._store = KeyframePicker(settings), KeyframeWriter(out)
-        self._thread = BackEndThread(BackEnd(settings, self._closer, gate))
+        self._thread = BackEndThread(BackEnd(settings, self._closer, gate), feedback is not None)
+        self._feedback = feedback
+        self._T_map_odom: list[NDArray[np.float64]] = []
+        if feedback is not None:
+            feedback.follow(self._thread.correction_after)
 
     def take(self, result: ScanResult) -> None:
         """Take the next scan's result; this never waits for the back end."""
         keyframe = self._picker(result)
+        if result.T_map_odom is not None:
+            self._T_map_odom.append(result.T_map_odom)
         if keyframe is not None:
+            if self._feedback is not None:
+                self._feedback.add_keyframe(result.index)
             self._store.append(keyframe.points, corner_marks(result))
             self._thread.add(light(keyframe))
 
@@ -162,6 +215,10 @@ class GlobalCorrection(Sink):
         self._store.finish(*self._of_all_stored(found, odometry, poses))
         with atomic_path(self._out / "odometry.tum") as aside:
             write_tum(aside, odometry)
+        if self._feedback is not None:
+            online = Trajectory(odometry.stamp_ns, np.array(self._T_map_odom) @ odometry.poses)
+            with atomic_path(self._out / "online.tum") as aside:
+                write_tum(aside, online)
         write_graph(self._out / "keyframes.g2o", _graph(found), np.arange(len(found.stamp_ns)))
         write_json(self._out / "loops.json", {"loops": [_loop(found, *one) for one in found.loops]})
         if found.T_enu_world is not None:

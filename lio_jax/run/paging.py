@@ -81,6 +81,18 @@ class KeyframePager:
         wanted = self._wanted()
         return state if wanted is None else self._program(self._params, state, self._page(wanted))
 
+    def moved(self, T_new_old: jaxlie.SE3, wxyz_xyz: NDArray[np.float64]) -> None:
+        """Take over corrected poses.
+
+        Args:
+            T_new_old: moves the vehicle, m.
+            wxyz_xyz: (n, 7) new T_world_lidar of all keyframes so far, by their running numbers.
+        """
+        self._here = np.asarray(T_new_old @ self._here)
+        self._stored = [one._replace(wxyz_xyz=wxyz_xyz[one.number]) for one in self._stored]
+        for index, one in enumerate(self._stored):
+            self._positions[index] = one.wxyz_xyz[4:]
+
     def _store(self, number: int, pose: NDArray[np.float64], time: float, output: Output) -> None:
         count = len(self._stored)
         if count == len(self._positions):

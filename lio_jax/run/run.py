@@ -14,6 +14,7 @@ from lio_jax.data.detect import without_effect
 from lio_jax.data.imu_checks import cleaned
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.run.clock_jumps import without_clock_jumps
+from lio_jax.run.feedback import Feedback
 from lio_jax.run.fitted_settings import (
     fitted_to_surroundings,
     notes_on_rings,
@@ -32,7 +33,7 @@ from lio_jax.run.scan_inputs import ImuFeed, feed_of
 from lio_jax.run.set_up_check import SetUpCheck
 from lio_jax.run.sinks import RunResult, Sink, finish_all
 from lio_jax.run.state_files import ImuRateFile, StateFiles
-from lio_jax.run.track import ScanResult, track
+from lio_jax.run.track import CompiledStep, ScanResult, track
 from lio_jax.run.verdict import Verdict
 from lio_jax.settings.settings import Settings, uses_imu, with_extrinsics
 
@@ -110,12 +111,13 @@ def run_sequence(
         began = time.perf_counter()
         imu, imu_notes = imu_feed(sequence, settings)
         step = step_of(sequence, settings, imu.samples if imu else None, start)
+        feedback = _feedback(step, settings)
         log, times = TrajectoryLog(), StageTimes("decode", "pad", "step", "record", "total")
         # the log last: wherever Ctrl-C comes, the others have every scan that it has
         everyone: list[Sink] = [times, Overflow(settings), Failures(start)]
         everyone += [SetUpCheck(settings, imu.samples if imu else None, notify), Verdict(settings)]
         everyone += [ScanLog(out / "scans.npz", start), log]
-        for sink in _result_files(sequence, settings, out, imu, log):
+        for sink in _result_files(sequence, settings, out, imu, log, feedback):
             stack.callback(sink.close)
             everyone.append(sink)
         everyone += sinks
@@ -123,7 +125,7 @@ def run_sequence(
         interruption: BaseException | None = None
         try:
             # closing: a sink that raises must not leave the decoding thread and its files behind
-            with closing(scans), closing(track(settings, scans, imu, step, journal)) as results:
+            with closing(scans), closing(track(settings, scans, imu, step, journal, feedback)) as results:
                 _hand_out(results, everyone, times.ms["record"])
         except (KeyboardInterrupt, Exception) as error:
             interruption = error
@@ -147,14 +149,36 @@ def run_sequence(
     return run
 
 
+def _feedback(step: CompiledStep, settings: Settings) -> Feedback | None:
+    """Return the way of corrections into the odometry; None where they are not wanted there.
+
+    Raises:
+        UsageError: there are no corrections, or the recipe takes none.
+    """
+    backend = settings.run.backend
+    if not backend.feedback:
+        return None
+    if not (backend.loops or backend.gps):
+        raise UsageError(
+            "config.backend.feedback=true has no effect without corrections; add config.backend.loops=true "
+            "or config.backend.gps=true."
+        )
+    return step.feedback()
+
+
 def _result_files(
-    sequence: Sequence, settings: Settings, out: Path, imu: ImuFeed | None, log: TrajectoryLog
+    sequence: Sequence,
+    settings: Settings,
+    out: Path,
+    imu: ImuFeed | None,
+    log: TrajectoryLog,
+    feedback: Feedback | None,
 ) -> Iterator[Sink]:
     """Yield the sinks that write a run's results, in the order in which they finish."""
     files = StateFiles(out, settings, log)
     yield files
     if settings.run.backend.loops or settings.run.backend.gps:
-        yield GlobalCorrection(sequence, settings, out, files)
+        yield GlobalCorrection(sequence, settings, out, files, feedback)
     elif settings.run.output.map:
         yield MapFile(out / "map.pcd")
     if imu and imu.samples:

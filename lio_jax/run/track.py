@@ -11,14 +11,16 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from lio_jax.core.errors import UsageError
 from lio_jax.core.types import ImuBatch, Scan
 from lio_jax.core.xla import programs
 from lio_jax.data.sequence import LidarScan, prefetched
 from lio_jax.data.trajectory import pose_matrices
 from lio_jax.recipes.params import RecipeParams as Params
-from lio_jax.recipes.recipe import PagingRecipe
+from lio_jax.recipes.recipe import CorrectingRecipe, PagingRecipe
 from lio_jax.recipes.transforms import RecipeLike, Stepper, reopened, with_first_velocity
 from lio_jax.run.failures import BridgedOutage, OutageWatch, ScanEvidence, failure_of, longest_gap
+from lio_jax.run.feedback import Feedback
 from lio_jax.run.journal import Journal
 from lio_jax.run.paging import KeyframePager, Pager
 from lio_jax.run.scan_inputs import ImuFeed, InputsInTurn, ScanInput
@@ -61,6 +63,9 @@ class ScanResult:
     """The outage after which a new piece of map begins with this scan."""
     raw: NDArray[np.float32] | None = None
     """(k, 3) some of the points as recorded, m in the lidar frame of their own firing, for pictures."""
+    T_map_odom: NDArray[np.float64] | None = None
+    """(4, 4) pose of the odometry's world in the corrected map that the scan was matched with, m; None
+    without feedback."""
 
 
 class Compiled:
@@ -125,6 +130,19 @@ class CompiledStep(Compiled):
         self.recipe = recipe_of(settings)
         super().__init__(self.recipe, settings.params())
 
+    def feedback(self) -> Feedback:
+        """Return a new feedback of the back end.
+
+        Raises:
+            UsageError: the recipe has none.
+        """
+        if not isinstance(self.recipe, CorrectingRecipe):
+            raise UsageError(
+                "config.backend.feedback=true moves keyframes, and this recipe matches scans with none; "
+                "leave it out, or take the recipe lio_sam."
+            )
+        return Feedback(self.recipe, self.params)
+
     def pager(self) -> Pager | None:
         """Return what hands parts of the map over during a new run; None where nothing does."""
         return KeyframePager(self.recipe, self.params) if isinstance(self.recipe, PagingRecipe) else None
@@ -136,6 +154,7 @@ def track(
     imu: ImuFeed | None = None,
     step: CompiledStep | None = None,
     journal: Journal | None = None,
+    feedback: Feedback | None = None,
 ) -> Generator[ScanResult]:
     """Yield the result of each scan in turn, each while the step of the next scan runs.
 
@@ -148,6 +167,7 @@ def track(
         imu: inertial samples; None where there are none or the recipe is to do without.
         step: of the same settings; None: a new one. It tells how long compiling took.
         journal: gives back the steps of a killed run, which are not computed again, and stores the others.
+        feedback: of ``step``; corrects the state between scans. Results lie in the frame of the odometry.
     """
     step = step or CompiledStep(settings)
     judged, pager = ResultBuilder(settings), step.pager()
@@ -155,12 +175,20 @@ def track(
     # closing: whoever stops early must not leave the decoding thread and its files behind
     with ThreadPoolExecutor(1) as reader, closing(scan_inputs(settings, scans, imu)) as inputs:
         for fed, nav, output, step_ms in journal.replayed(step, inputs) if journal else ():
+            T_map_odom = None
+            if feedback is not None:
+                feedback.applied(None, fed.index, pager)
+                feedback.take(fed.end_ns, output)
             if pager is not None:
                 pager.take(output)
-            yield judged(fed, nav, output.registration, output, step_ms)
+            if feedback is not None:
+                T_map_odom, nav, output = feedback.in_odometry(nav, output)
+            yield judged(fed, nav, output.registration, output, step_ms, T_map_odom)
         compiled_s = step.compile_s
         try:
-            for fed, state, output in run_steps(step, inputs, journal.state if journal else None, pager):
+            for fed, state, output in run_steps(
+                step, inputs, journal.state if journal else None, pager, feedback
+            ):
                 reading = reader.submit(on_host, state.nav, output.registration)
                 compiled_in_step_s, compiled_s = step.compile_s - compiled_s, step.compile_s
                 if held is not None:
@@ -168,9 +196,14 @@ def track(
                     yield judged(*last)
                 nav, registration, read_at = reading.result()
                 step_ms = (read_at - fed.begun_at - compiled_in_step_s) * 1e3
-                held = fed, nav, registration, output, step_ms
                 if journal is not None:
                     journal.add(fed, nav, output, step_ms, state if fed.usable else None)
+                T_map_odom = None
+                if feedback is not None:
+                    output = replace(output, registration=registration)
+                    T_map_odom, nav, output = feedback.in_odometry(nav, output)
+                    registration = output.registration
+                held = fed, nav, registration, output, step_ms, T_map_odom
         except (KeyboardInterrupt, Exception):
             if held is not None:
                 yield judged(*held)
@@ -195,7 +228,13 @@ class ResultBuilder:
         self._outages = OutageWatch()
 
     def __call__(
-        self, fed: ScanInput, nav: Any, registration: Any, output: Any, step_ms: float
+        self,
+        fed: ScanInput,
+        nav: Any,
+        registration: Any,
+        output: Any,
+        step_ms: float,
+        T_map_odom: NDArray[np.float64] | None = None,
     ) -> ScanResult:
         """Return the result of a scan; ``nav`` and ``registration`` have numpy leaves."""
         evidence = ScanEvidence(
@@ -233,6 +272,7 @@ class ResultBuilder:
             has_imu=fed.imu is not None,
             outage=self._outages(fed.end_ns, evidence, output.covariance),
             raw=_some(np.asarray(fed.scan.points)[: fed.count]),
+            T_map_odom=T_map_odom,
         )
 
 
@@ -253,7 +293,13 @@ class StepsInTurn:
     how fast the vehicle was.
     """
 
-    def __init__(self, stepper: Stepper, state: Any = None, pager: Pager | None = None) -> None:
+    def __init__(
+        self,
+        stepper: Stepper,
+        state: Any = None,
+        pager: Pager | None = None,
+        feedback: Feedback | None = None,
+    ) -> None:
         """Begin a run.
 
         Args:
@@ -261,9 +307,11 @@ class StepsInTurn:
             state: after a usable scan before the first one here; it is consumed. None: the run is new.
             pager: hands parts of the map over; it has taken the outputs of the scans before the first one
                 here. None: what a recipe has no more room for is lost.
+            feedback: corrects the state between scans; it has taken the same outputs as the pager. None:
+                nothing is corrected.
         """
-        self._stepper, self._pager = stepper, pager
-        self._last: Any = None
+        self._stepper, self._pager, self._feedback = stepper, pager, feedback
+        self._last: tuple[ScanInput, Any] | None = None
         self._state = state
         self._opened = state is not None
         self._held: tuple[ScanInput, Any, Any] | None = None
@@ -271,34 +319,42 @@ class StepsInTurn:
     def take(self, fed: ScanInput) -> Iterator[tuple[ScanInput, Any, Any]]:
         """Yield scans with the state and the output after each; a state is consumed when the next is asked
         for."""
-        state = self._paged()
+        state = self._between(fed)
         if self._held is not None:
             first, state, output = self._held
             self._held = None
             if fed.usable:
                 first = replace(first, begun_at=time.perf_counter())
                 state, output = reopened(self._stepper, state, output, first, fed)
-            if self._pager is not None:
-                self._pager.take(output)
+            self._remember(first, output)
             yield first, state, output
         fed = replace(fed, begun_at=time.perf_counter())
         begins = fed.usable and not self._opened
         if state is None or begins:
             state = self._stepper.init(fed.before)
         self._state, output = self._stepper.step(state, fed.scan, fed.imu)
-        self._last = output
+        self._last = fed, output
         if begins:
             self._held, self._opened = (fed, self._state, output), True
         else:
             yield fed, self._state, output
 
-    def _paged(self) -> Any:
-        """Return the state after the last scan, with what the pager hands over."""
-        if self._pager is None or self._held is not None or self._state is None:
-            return self._state
+    def _between(self, fed: ScanInput) -> Any:
+        """Return the state before a scan, with its keyframes corrected and with what the pager hands over."""
+        state = self._state
+        if self._held is not None or state is None:
+            return state
         if self._last is not None:
-            self._pager.take(self._last)
-        return self._pager.paged(self._state)
+            self._remember(*self._last)
+        if self._feedback is not None:
+            state = self._feedback.applied(state, fed.index, self._pager)
+        return state if self._pager is None else self._pager.paged(state)
+
+    def _remember(self, fed: ScanInput, output: Any) -> None:
+        if self._feedback is not None:
+            self._feedback.take(fed.end_ns, output)
+        if self._pager is not None:
+            self._pager.take(output)
 
     def rest(self) -> Iterator[tuple[ScanInput, Any, Any]]:
         """Yield the first usable scan where no other one came after it."""
@@ -312,6 +368,7 @@ def run_steps(
     scan_inputs: Iterable[ScanInput],
     state: Any = None,
     pager: Pager | None = None,
+    feedback: Feedback | None = None,
 ) -> Iterator[tuple[ScanInput, Any, Any]]:
     """Yield each scan with the state and the output after it; the state is consumed by the next one.
 
@@ -323,8 +380,9 @@ def run_steps(
         state: after a usable scan before these, from which to go on; it is consumed. None: these are the
             first ones.
         pager: hands parts of the map over, see :class:`StepsInTurn`.
+        feedback: corrects the state between scans, see :class:`StepsInTurn`.
     """
-    steps = StepsInTurn(stepper, state, pager)
+    steps = StepsInTurn(stepper, state, pager, feedback)
     try:
         for fed in scan_inputs:
             yield from steps.take(fed)

@@ -50,7 +50,7 @@ def names_back_end(patterns: Listing[str], settings: Settings) -> bool:
         settings: of the run.
 
     Raises:
-        UsageError: they name both, or the run has no back end.
+        UsageError: they name both, or the run has no back end or feeds its corrections back.
     """
     own, shared = settings_of(recipe_named(settings.recipe).params_type), settings_of(GlobalParams)
     back_end = [one for one in patterns if named_leaves(one, shared) and not named_leaves(one, own)]
@@ -66,6 +66,11 @@ def names_back_end(patterns: Listing[str], settings: Settings) -> bool:
         raise UsageError(
             f"'{back_end[0]}' has no effect without the back end; add --set config.backend.loops=true or "
             "config.backend.gps=true."
+        )
+    if backend.feedback:
+        raise UsageError(
+            f"'{back_end[0]}' is tuned for an odometry that does not depend on it; leave "
+            "config.backend.feedback=true out."
         )
     return True
 

@@ -3,11 +3,13 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
 
 from lio_jax.core.types import CONVERGED
-from lio_jax.estimation.sliding_window import Added, append_and_update, open_window
+from lio_jax.estimation.chain import information_of, linearise
+from lio_jax.estimation.sliding_window import Added, append_and_update, moved_by, open_window
 from tests.estimation.linear_chain import GRAVITY, linear_chain, log_likelihood, row_of
 from tests.estimation.smoothing import ROWS, evidence_of, smoothed
 from tests.imu.motion import quick_jit
@@ -64,3 +66,18 @@ def test_the_evidence_of_what_was_forgotten_is_kept(linear, along):
 
 def test_the_window_fills_before_it_forgets(along):
     assert [int(window.chain.count) for window, _ in along[:5]] == [2, 3, 4, 4, 4]
+
+
+def test_another_world_frame_changes_no_cost(along):
+    window = along[-1][0]
+    T_new_old = jaxlie.SE3.from_rotation_and_translation(
+        jaxlie.SO3.from_z_radians(jnp.asarray(2.0)), jnp.array([30.0, -20.0, 5.0])
+    )
+    # away from the minimum, where no gradient is zero
+    apart = window.states.retract(jnp.asarray(np.random.default_rng(0).normal(0, 0.1, (CAPACITY, 15))))
+    window = eqx.tree_at(lambda window: window.states, window, apart)
+    normal = quick_jit(lambda window: linearise(window.chain, information_of(window.chain), window.states))
+    before, after = normal(window), normal(moved_by(window, T_new_old))
+    np.testing.assert_allclose(after.cost, before.cost, rtol=1e-9)
+    np.testing.assert_allclose(after.gradient, before.gradient, rtol=1e-6, atol=1e-6 * before.cost)
+    np.testing.assert_allclose(after.matrix.diagonal, before.matrix.diagonal, rtol=1e-6, atol=1e-6)

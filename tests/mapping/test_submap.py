@@ -2,12 +2,20 @@
 
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from lio_jax.mapping.feature_map import FeaturePoints, Submap, empty_feature_map, frames_at, with_scan
+from lio_jax.mapping.feature_map import (
+    FeaturePoints,
+    Submap,
+    empty_feature_map,
+    frames_at,
+    rebuilt,
+    with_scan,
+)
 from lio_jax.mapping.keyframes import no_keyframes
 from lio_jax.mapping.nearest_points import nearest_points
 from lio_jax.settings.settings import recipe_settings
@@ -79,3 +87,25 @@ def test_a_keyframe_enters_anew_when_the_vehicle_comes_back():
     submap = _add(submap, jnp.array(False), points(9), pose(10.0), jnp.asarray(95.0))[0]
     distance = in_map(submap, pose(0.0), points(1))
     assert np.mean(distance < 1e-3) > 0.95
+
+
+def test_a_map_built_anew_holds_the_keyframes_around_at_their_new_poses():
+    submap = empty()
+    for number, x in enumerate((0.0, 20.0, 90.0)):
+        time = jnp.asarray(20.0 * number)
+        submap = _add(submap, jnp.array(True), points(1 + number), pose(x), time)[0]
+    sparse = submap.keyframes.sparse.at[submap.keyframes.last].set(False)
+    submap = eqx.tree_at(lambda some: some.keyframes.sparse, submap, sparse)
+    poses = submap.keyframes.T_world_lidar.wxyz_xyz.at[:, 4:].add(jnp.array([500.0, 7.0, -3.0]))
+    moved = [jaxlie.SE3(poses[np.flatnonzero(submap.keyframes.number == number)[0]]) for number in range(3)]
+    again = partial(rebuilt, map_params=PARAMS.map, point_map=PARAMS.point_map, settings=PARAMS.submap)
+    submap = jax.jit(again)(submap, jaxlie.SE3(poses), moved[2], jnp.asarray(41.0))
+    by_number = dict(zip(submap.keyframes.number.tolist(), submap.keyframes.entered.tolist(), strict=True))
+    assert by_number == {0: False, 1: False, 2: True, -1: False}
+    assert np.mean(in_map(submap, moved[2], points(3)) < 1e-3) > 0.95
+    assert in_map(submap, moved[0], points(1)).min() > 1
+    submap = jax.jit(again)(submap, jaxlie.SE3(poses), moved[1], jnp.asarray(80.0))
+    by_number = dict(zip(submap.keyframes.number.tolist(), submap.keyframes.entered.tolist(), strict=True))
+    assert by_number == {0: True, 1: True, 2: False, -1: False}
+    held = [np.mean(in_map(submap, moved[number], points(1 + number)) < 1e-3) for number in (0, 1)]
+    assert min(held) > 0.8

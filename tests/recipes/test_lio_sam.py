@@ -80,6 +80,41 @@ def drive():
     return run()
 
 
+CORRECT = PerShape(jax.jit(LioSam(CONFIG).corrected))
+
+
+@pytest.mark.parametrize(
+    ("yaw", "position", "most_turned", "most_moved"),
+    [
+        # the grids of both maps, 1.2 m and 0.6 m, lie on themselves: the maps hold the same points
+        (0.0, (12.0, -24.0, 3.6), 1e-3, 1e-3),
+        (np.pi / 2, (1.2, 2.4, 0.0), 1e-3, 1e-3),
+        # other points survive the thinning
+        (0.1, (3.3, -1.7, 0.25), 2e-3, 0.03),
+    ],
+)
+def test_a_rigid_correction_moves_the_next_scans_rigidly(drive, yaw, position, most_turned, most_moved):
+    inputs, _ = arrays()
+    states, _, poses = drive
+    last = SCANS - 3
+    T = jaxlie.SE3.from_rotation_and_translation(
+        jaxlie.SO3.from_z_radians(jnp.asarray(yaw)), jnp.asarray(position)
+    )
+    keyframes = T @ states[last].map.keyframes.T_world_lidar
+    state = CORRECT(PARAMS, states[last], T, keyframes)
+    own_axes = [one.nav.T_world_imu.rotation().inverse() @ one.nav.velocity for one in (state, states[last])]
+    np.testing.assert_allclose(*own_axes, atol=1e-12)
+    np.testing.assert_array_equal(state.map.keyframes.corner, states[last].map.keyframes.corner)
+    for number in (last + 1, last + 2):
+        state, output = STEP(PARAMS, state, *inputs[number])
+        apart = np.linalg.inv(np.asarray(T.as_matrix()) @ poses[number]) @ state.nav.T_world_imu.as_matrix()
+        assert not output.lost
+        assert Rotation.from_matrix(apart[:3, :3]).magnitude() < most_turned
+        assert np.linalg.norm(apart[:3, 3]) < most_moved
+        np.testing.assert_allclose(state.nav.gyro_bias, states[number].nav.gyro_bias, atol=1e-5)
+        np.testing.assert_allclose(state.nav.accel_bias, states[number].nav.accel_bias, atol=1e-4)
+
+
 def speed_at(number: int) -> float:
     return float(np.linalg.norm(truth()[number, :3, 3] - truth()[number - 1, :3, 3]) / 0.1)
 

@@ -98,3 +98,15 @@ def test_many_keyframes_are_kept(pager):
         pager.take(output(number, 2.0 * number, [number]))
     pager.take(output(-1, 250.0, [299]))
     assert int(pager.paged(jnp.zeros(())).number) == 125
+
+
+def test_a_corrected_keyframe_comes_back_where_it_now_lies(pager):
+    for number in range(3):
+        pager.take(output(number, 40.0 * number, [number]))
+    there = np.stack([pose(1040.0 - 40.0 * number, yaw=1.0) for number in range(3)])
+    move = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), jnp.array([960.0, 0.0, 0.0]))
+    pager.moved(move, there)
+    # the vehicle is at 1040 m, where the first keyframe now lies
+    page = pager.paged(jnp.zeros(()))
+    assert int(page.number) == 0
+    np.testing.assert_array_equal(page.T_world_lidar.wxyz_xyz, there[0])

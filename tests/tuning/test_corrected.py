@@ -165,6 +165,12 @@ def test_derivatives_are_central_differences(objective, fixes, elevation):
         (["gps.lever_arm", "imu.*"], ["config.backend.gps=true"], "ate", "one after the other"),
         (["loop.*"], ["config.backend.loops=true"], "noise", "take the objective ate"),
         (["loop.radius"], ["config.backend.loops=true"], "ate", "has no derivative"),
+        (
+            ["backend.*"],
+            ["config.backend.loops=true", "config.backend.feedback=true"],
+            "ate",
+            "config.backend.feedback=true out",
+        ),
     ],
 )
 def test_what_cannot_be_tuned_is_refused(patterns, overrides, named, words):
