@@ -14,7 +14,7 @@ from lio_jax.core.xla import programs
 from lio_jax.data.cloud_files import read_cloud
 from lio_jax.data.trajectory import read_tum
 from lio_jax.recipes.recipe import LocalisingRecipe, Output
-from lio_jax.run.map_file import CLOUD_ENDINGS
+from lio_jax.run.map_file import CLOUD_ENDINGS, FARTHEST
 
 _TILE = 20.0
 """Edge of the tiles in which a map is handed over, m."""
@@ -63,16 +63,17 @@ class KnownMap:
             raise LioJaxError(
                 f"{file}: no such map; give the folder of a run with map.pcd, or a .pcd or .ply file."
             )
-        reasons: list[str] = []
-        cloud = read_cloud(file, reasons.append)
-        if cloud is None:
-            raise LioJaxError(" ".join(reasons))
+        faults: list[str] = []
+        cloud = read_cloud(file, faults.append)
+        if cloud is None or faults:
+            raise LioJaxError(f"{file}: damaged or cut short; write the map again.")
         if not {"x", "y", "z"} <= set(cloud.dtype.names or ()):
             raise LioJaxError(f"{file}: has no fields x, y and z; write the map again.")
         points = np.stack([cloud[axis].astype(np.float64).ravel() for axis in "xyz"], axis=-1)
-        points = points[np.isfinite(points).all(axis=1)]
+        # a comparison with NaN is False
+        points = points[(np.abs(points) < FARTHEST).all(axis=1)]
         if not len(points):
-            raise LioJaxError(f"{file}: holds no finite points; write the map again.")
+            raise LioJaxError(f"{file}: holds no possible points; write the map again.")
         return KnownMap(points)
 
     def around(self, position: NDArray[np.float64], reach: float) -> NDArray[np.float32]:

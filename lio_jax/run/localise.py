@@ -37,6 +37,13 @@ class FoundStart:
     fitness: float
     """Mean squared distance to the map of the points that have a counterpart there, m^2."""
 
+    def __str__(self) -> str:
+        position = ", ".join(f"{number:.2f}" for number in self.T_world_imu[:3, 3])
+        return (
+            f"the first scan lies in the known map at [{position}] m, heading "
+            f"{heading_of(self.T_world_imu):.3f} rad; {self.overlap:.2f} of its points agree."
+        )
+
     def as_dict(self) -> dict[str, Any]:
         """Return position, heading and the two measures as plain numbers."""
         return {

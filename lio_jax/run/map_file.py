@@ -90,7 +90,7 @@ _TILE_M = 40.0
 """Approximate edge of a tile, m: the map is cut along x and y, and a tile holds whole voxels."""
 _KEPT = 2_000_000
 """Number of points that are kept in memory before they go to their tiles."""
-_FARTHEST = 1e6
+FARTHEST = 1e6
 """Points farther from the origin than this are not part of a map, m."""
 _POINT = np.dtype(("<f4", 3))
 
@@ -128,7 +128,7 @@ class MapTiles:
             points: (n, 3) m, in the IMU frame; points that are not finite are left out.
         """
         world = points.astype(np.float64) @ T_world_imu[:3, :3].T + T_world_imu[:3, 3]
-        world = world[(np.abs(world) < _FARTHEST).all(axis=1)]
+        world = world[(np.abs(world) < FARTHEST).all(axis=1)]
         if not len(world):
             return
         self.taken += len(world)

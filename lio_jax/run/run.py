@@ -94,7 +94,8 @@ def run_sequence(
         sinks: your own, derived from :class:`lio_jax.Sink`: each takes every scan's result after the run's
             own sinks, and finishes after them, when their files are written. What it raises in ``take`` ends
             the run early; what it raises in ``finish`` costs its own results alone.
-        notify: takes each sentence on a fault of the set-up as soon as it is known.
+        notify: takes each sentence on a fault of the set-up as soon as it is known, and where the run begins
+            in a known map.
         journal: of this run (:func:`lio_jax.run.journal.opened_journal`). All sinks take every scan of a
             resumed run, once, as those of a run that was never killed. ``result.output`` of a scan before the
             checkpoint has numpy leaves. None: the run cannot be resumed.
@@ -112,6 +113,8 @@ def run_sequence(
         imu, imu_notes = imu_feed(sequence, settings)
         step = step_of(sequence, settings, imu.samples if imu else None, start)
         feedback = _feedback(step, settings)
+        if isinstance(step, LocalisingStep) and notify is not None:
+            notify(f"note: {step.start}")
         log, times = TrajectoryLog(), StageTimes("decode", "pad", "step", "record", "total")
         # the log last: wherever Ctrl-C comes, the others have every scan that it has
         everyone: list[Sink] = [times, Overflow(settings), Failures(start)]

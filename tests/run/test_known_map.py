@@ -67,7 +67,9 @@ def test_a_start_is_found_in_the_map(tmp_path, recording, known, earlier, way):
     extra = ["config.known_map.search=true"]
     if way == "near":
         extra = near(earlier[1], LATER, (2.5, -2.0, 0.4), 0.3)
-    run = run_sequence(recording, with_overrides(known, extra), tmp_path, LATER)
+    said = []
+    run = run_sequence(recording, with_overrides(known, extra), tmp_path, LATER, notify=said.append)
+    assert said[0].startswith("note: the first scan lies in the known map at [")
     # in the world of the earlier run, not aligned: its own errors there are 1 cm
     assert errors(run.trajectory, earlier[1]).max() < 0.03
     start = json.loads((tmp_path / "metrics.json").read_text())["start_in_known_map"]
@@ -126,10 +128,10 @@ def test_places_and_ways_that_do_not_fit_are_named(tmp_path, recording, known, r
     fails(LioJaxError, r"gone: no such map|gone.*give the folder", f"config.known_map.path={tmp_path}/gone")
     empty = tmp_path / "empty.pcd"
     write_cloud(empty, [], 0)
-    fails(LioJaxError, "empty.pcd: holds no finite points", f"config.known_map.path={empty}")
+    fails(LioJaxError, "empty.pcd: holds no possible points", f"config.known_map.path={empty}")
     torn = tmp_path / "torn.ply"
     torn.write_bytes(b"ply\nformat")
-    fails(LioJaxError, "torn.ply", f"config.known_map.path={torn}")
+    fails(LioJaxError, "torn.ply: damaged or cut short", f"config.known_map.path={torn}")
     fails(
         LioJaxError,
         "trajectory.tum: no such file",
