@@ -6,6 +6,7 @@ import re
 import secrets
 import shutil
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -20,7 +21,10 @@ from numpy.typing import NDArray
 from lio_jax.core.errors import LioJaxError
 
 _TOKEN_BYTES = 4
-_DAMAGES = (KeyError, EOFError, MemoryError, RuntimeError, struct.error, zipfile.BadZipFile, zlib.error)
+_DAMAGES = (
+    *(KeyError, EOFError, MemoryError, RuntimeError),
+    *(struct.error, zipfile.BadZipFile, zlib.error, tokenize.TokenError),
+)
 """What a damaged .npz file may raise in addition to ValueError."""
 _MOST_NODES = 100_000
 """Largest number of values in a YAML text, with aliases written out: a few lines can stand for billions."""

@@ -53,7 +53,7 @@ def values_for(path: str) -> st.SearchStrategy:
     """Return possible values of a path, as YAML would give them."""
     if path == "params.extrinsics.rotation":
         return st.integers(0, 2**32 - 1).map(lambda seed: Rotation.random(rng=seed).as_quat().tolist())
-    if path in ("params.extrinsics.translation", "params.gps.lever_arm", "params.initial.velocity"):
+    if isinstance(DECLARED[path].declared.default, tuple) and len(DECLARED[path].declared.default) == 3:
         return st.lists(st.floats(-100, 100), min_size=3, max_size=3)
     if path in PARAMS and DECLARED[path].declared.per_ring:
         return st.lists(st.floats(-0.1, 0.1), max_size=5)
