@@ -29,7 +29,7 @@ def sections() -> dict[str, str]:
 
 def test_every_picture_has_a_script_and_its_command():
     found = sections()
-    assert len(found) == 10
+    assert len(found) == 11
     assert set(found) == {path.stem for path in GALLERY.glob("*.py")} - {SHARED}
     assert set(found) == {path.stem for path in GALLERY.glob("*.png")}
     for name, part in found.items():
