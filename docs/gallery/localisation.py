@@ -1,4 +1,4 @@
-"""Draw a second lap that begins in the map of the first one, at a place that nobody has told it."""
+"""Draw a second lap that begins in the map of the first one, at a place that is searched."""
 
 import tempfile
 from pathlib import Path

@@ -22,8 +22,14 @@ from lio_jax.core.errors import LioJaxError
 
 _TOKEN_BYTES = 4
 _DAMAGES = (
-    *(KeyError, EOFError, MemoryError, RuntimeError),
-    *(struct.error, zipfile.BadZipFile, zlib.error, tokenize.TokenError),
+    KeyError,
+    EOFError,
+    MemoryError,
+    RuntimeError,
+    struct.error,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
 )
 """What a damaged .npz file may raise in addition to ValueError."""
 _MOST_NODES = 100_000

@@ -1,5 +1,7 @@
 """Types that every floor shares: pytrees of scans, samples and states, and the status codes of solves."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -65,6 +67,11 @@ class NavState(eqx.Module):
     """Extrinsic pose of the lidar in the IMU frame, m."""
     time_offset: Float[Array, ""]
     """Lag of the lidar's clock, s: a scan stamped t was taken at IMU time t + time_offset."""
+
+    def at_pose(self, T_world_imu: jaxlie.SE3) -> "NavState":
+        """Return the state at another pose, m, its velocity turned with it; gravity stays."""
+        turn = T_world_imu.rotation() @ self.T_world_imu.rotation().inverse()
+        return dataclasses.replace(self, T_world_imu=T_world_imu, velocity=turn @ self.velocity)
 
 
 def initial_nav_state(T_imu_lidar: jaxlie.SE3, gravity_magnitude: float = 9.80665) -> NavState:

@@ -6,20 +6,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.loops.alignment import aligned
-from lio_jax.loops.keyframe import Keyframe, padded, thinned
-from lio_jax.loops.overlap import LEAST_POINTS, Candidate, CloudComparison
+from lio_jax.loops.keyframe import Keyframe
+from lio_jax.loops.overlap import Candidate
 from lio_jax.loops.params import BackEndSettings
 from lio_jax.loops.place_descriptor import DescribedPlaces, Likeness
-from lio_jax.loops.verification import (
-    ALIGNED_SPACING,
-    SOURCE_REACH,
-    TARGET_REACH,
-    aligning_params,
-    fits,
-    guesses_at,
-    upright_cells,
-)
+from lio_jax.loops.verification import SOURCE_REACH, TARGET_REACH, Guess, compare
 
 _Array = NDArray[np.float64]
 
@@ -60,28 +51,11 @@ def places_near(
         errors: largest horizontal error of the position, m, and of the heading, rad.
         settings: ``config.loops`` and ``params.loop``.
     """
-    limits, sizes = settings.values["loop"], settings.run.loops
-    theirs = thinned(known.around(position, TARGET_REACH), ALIGNED_SPACING)
-    ours = thinned(scan[np.abs(scan[:, :2]).max(axis=1, initial=0) < SOURCE_REACH], ALIGNED_SPACING)
-    their_cells, their_upright = upright_cells(theirs)
-    our_cells, our_upright = upright_cells(ours)
-    if min(np.sum(their_upright), np.sum(our_upright)) < LEAST_POINTS:
-        return []
     shift_error, turn_error = errors
-    found = fits(our_cells, their_cells, heading, turn_error, np.zeros(2), shift_error, sizes.starts)
-    if not len(found.turn):
-        return []
-    guesses = guesses_at(found, np.zeros((1, 3)))
-    result = aligned(
-        *padded(theirs, sizes.target_points),
-        *padded(ours, sizes.source_points),
-        guesses,
-        sizes.starts,
-        aligning_params(settings),
-    )
-    comparison = CloudComparison(theirs, guesses[:, :3, 3], ours[our_upright], limits["overlap_distance"])
-    candidates = comparison.candidates(result, np.tile(np.eye(4), (2, 1, 1)))
-    return [replace(one, T_target_source=_moved(one.T_target_source, position)) for one in candidates]
+    near = scan[np.abs(scan[:, :2]).max(axis=1, initial=0) < SOURCE_REACH]
+    guess = Guess(heading, turn_error, np.zeros(2), shift_error)
+    found = compare(known.around(position, TARGET_REACH), near, guess, settings).candidates
+    return [replace(one, T_target_source=_moved(one.T_target_source, position)) for one in found]
 
 
 def _moved(pose: _Array, by: _Array) -> _Array:

@@ -129,7 +129,7 @@ def _turned(centres: _Plan, weight: _Plan, angle: float) -> _Plan:
 
 _Array = NDArray[np.float64]
 
-ALIGNED_SPACING = 0.4
+_SPACING = 0.4
 """Edge of the cubes to which the aligned points are thinned, m."""
 _BELIEVED = 0.03
 """Share of an alignment's information that is believed, because neighbouring points share the map's error."""
@@ -187,40 +187,85 @@ def verify(
     theirs = level_points(keyframes, poses, target, members, TARGET_REACH)
     before = same_piece(keyframes, source, range(max(0, source - sizes.source_keyframes + 1), source + 1))
     ours = level_points(keyframes, poses, source, before, SOURCE_REACH)
-    theirs, ours = thinned(theirs, ALIGNED_SPACING), thinned(ours, ALIGNED_SPACING)
-    their_cells, their_upright = upright_cells(theirs)
-    our_cells, our_upright = upright_cells(ours)
-    if min(np.sum(their_upright), np.sum(our_upright)) < LEAST_POINTS:
-        return refused(proposal, "nothing upright to compare")
-
     level = _level(proposal.T_target_source, poses[target], poses[source])
-    found = fits(
-        our_cells,
-        their_cells,
-        heading_of(level),
-        proposal.turn_error,
-        level[:2, 3],
-        proposal.shift_error,
-        sizes.starts,
-    )
-    if not len(found.turn):
-        return refused(proposal, "no fit within the odometry's possible error")
     stations = poses[members, :3, 3] - poses[target, :3, 3]
-    result = aligned(
-        *padded(theirs, sizes.target_points),
-        *padded(ours, sizes.source_points),
-        guesses_at(found, stations),
-        sizes.starts,
-        aligning_params(settings),
-    )
-    comparison = CloudComparison(theirs, stations, ours[our_upright], limits["overlap_distance"])
-    candidates = comparison.candidates(result, poses[[target, source]])
+    guess = Guess(heading_of(level), proposal.turn_error, level[:2, 3], proposal.shift_error)
+    compared = compare(theirs, ours, guess, settings, stations, poses[[target, source]])
+    if compared.problem:
+        return refused(proposal, compared.problem)
     seen = level_points(keyframes, poses, source, [source], TARGET_REACH)
 
     def conflicting(T: _Array) -> float:
-        return conflict(seen, theirs[their_upright], T)
+        return conflict(seen, compared.upright, T)
 
-    return _judged(proposal, candidates, conflicting, poses[[target, source]], limits)
+    return _judged(proposal, compared.candidates, conflicting, poses[[target, source]], limits)
+
+
+class Guess(NamedTuple):
+    """Where the source's points lie among the target's, and how wrong that may be."""
+
+    turn: float
+    """Rotation of the source about z, rad."""
+    turn_error: float
+    """Largest error of ``turn``, rad."""
+    shift: _Plan
+    """(2,) position of the source's origin in the target, m."""
+    shift_error: float
+    """Largest error of ``shift``, m."""
+
+
+class Compared(NamedTuple):
+    """Two clouds that were compared."""
+
+    candidates: list[Candidate]
+    """Alignments of the source with the target, the one with the most overlap first."""
+    upright: NDArray[np.float32]
+    """(m, 3) points of the target on upright objects, m."""
+    problem: str
+    """Why nothing was aligned; empty where something was."""
+
+
+def compare(
+    theirs: NDArray[np.float32],
+    ours: NDArray[np.float32],
+    guess: Guess,
+    settings: BackEndSettings,
+    stations: _Array | None = None,
+    poses: _Array | None = None,
+) -> Compared:
+    """Fit the upright objects of two clouds, align the clouds from the fits, and measure the overlap.
+
+    Args:
+        theirs: (m, 3) points of the target in level axes, m, with |x| and |y| below ``TARGET_REACH``.
+        ours: (n, 3) points of the source in level axes, m, with |x| and |y| below ``SOURCE_REACH``.
+        guess: where to search.
+        settings: ``config.loops`` and ``params.loop``.
+        stations: (k, 3) positions from which the target was seen, m. None: the fits, at the target's height.
+        poses: (2, 4, 4) current T_world_imu of the target and of the source, m; None: both at the origin.
+    """
+    sizes = settings.run.loops
+    theirs, ours = thinned(theirs, _SPACING), thinned(ours, _SPACING)
+    their_cells, their_upright = upright_cells(theirs)
+    our_cells, our_upright = upright_cells(ours)
+    upright = theirs[their_upright]
+    if len(upright) < LEAST_POINTS or np.sum(our_upright) < LEAST_POINTS:
+        return Compared([], upright, "nothing upright to compare")
+    found = fits(our_cells, their_cells, *guess, sizes.starts)
+    if not len(found.turn):
+        return Compared([], upright, "no fit within the odometry's possible error")
+    guesses = _guesses(found, np.zeros((1, 3)) if stations is None else stations)
+    result = aligned(
+        *padded(theirs, sizes.target_points),
+        *padded(ours, sizes.source_points),
+        guesses,
+        sizes.starts,
+        _aligning_params(settings),
+    )
+    stations = guesses[:, :3, 3] if stations is None else stations
+    within = settings.values["loop"]["overlap_distance"]
+    comparison = CloudComparison(theirs, stations, ours[our_upright], within)
+    poses = np.tile(np.eye(4), (2, 1, 1)) if poses is None else poses
+    return Compared(comparison.candidates(result, poses), upright, "")
 
 
 def _judged(
@@ -314,7 +359,7 @@ def _level(T_target_source: _Array, T_world_target: _Array, T_world_source: _Arr
     return level
 
 
-def guesses_at(found: Fits, targets: _Array) -> _Array:
+def _guesses(found: Fits, targets: _Array) -> _Array:
     """Return the (n, 4, 4) poses of the fits, m, at the height of the nearest of the target's keyframes.
 
     Args:
@@ -329,7 +374,7 @@ def guesses_at(found: Fits, targets: _Array) -> _Array:
     return guesses
 
 
-def aligning_params(settings: BackEndSettings) -> AlignmentParams:
+def _aligning_params(settings: BackEndSettings) -> AlignmentParams:
     """Return the parameters of the alignment: the run's where its recipe has them, else the defaults."""
     values = {
         section: {name: settings.values[section].get(name, default) for name, default in leaves.items()}

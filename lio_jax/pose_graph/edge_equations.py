@@ -87,8 +87,7 @@ def _solved_columns(
         _, solved, failed = lapack.dposv(_dense(i, j, held, blocks, diagonal), columns, lower=True)
         return np.full_like(right, np.nan) if failed else solved.T.reshape(right.shape)
     size = diagonal.shape[-1]
-    edges = (vertex.astype(np.int64).tobytes() for vertex in (i, j))
-    structure = _structure(*edges, held.tobytes(), size)
+    structure = structure_holding(i, j, held, size)
     solution = right.copy()
     if structure.count:
         of_vertices, of_pairs = blocks_of(structure, blocks)
@@ -134,9 +133,22 @@ def blocks_of(
     return diagonal[:-1], pairs[:-1]
 
 
+def structure_holding(i: NDArray, j: NDArray, held: NDArray[np.bool_], tangent_size: int) -> Structure:
+    """Return the structure of a graph whose held vertices are known; those of the last graphs are kept.
+
+    Args:
+        i: (e,) first vertex of each edge.
+        j: (e,) second vertex of each edge.
+        held: (n,) True for vertices that keep their pose.
+        tangent_size: 6 in space, 3 in the plane.
+    """
+    first, second = (vertex.astype(np.int64).tobytes() for vertex in (i, j))
+    return _structure(first, second, held.tobytes(), tangent_size)
+
+
 @lru_cache(maxsize=16)
 def _structure(i: bytes, j: bytes, held: bytes, tangent_size: int) -> Structure:
-    """Return the structure of a graph whose held vertices are known; the order of elimination is kept."""
+    """Return the structure; the order of elimination, which it finds once, is kept with it."""
     first, second = np.frombuffer(i, np.int64), np.frombuffer(j, np.int64)
     still = np.frombuffer(held, bool)
     part = parts_of(len(still), first, second)

@@ -38,6 +38,10 @@ class Linearised(NamedTuple):
     g_j: Float[Array, "e d"]
     """Gradient for the second vertex."""
 
+    def blocks(self) -> Float[Array, "e h h"]:
+        """Return each edge's part of H, h = 2 d: the d rows of the first vertex, then those of the second."""
+        return jnp.block([[self.H_ii, self.H_ij], [_turned(self.H_ij), self.H_jj]])
+
 
 def residuals(T_world_i: Poses, T_world_j: Poses, graph: PoseGraph) -> Float[Array, "e d"]:
     """Return Log(Z^-1 T_i^-1 T_j) of each edge, Log(Z^-1 T_j) of a prior, (0, T_j l - z) of a position.

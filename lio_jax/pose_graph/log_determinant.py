@@ -9,15 +9,15 @@ from scipy.linalg import solve_triangular
 
 from lio_jax.pose_graph import multifrontal
 from lio_jax.pose_graph.block_cholesky import ChainFactor, factorise
-from lio_jax.pose_graph.edge_equations import blocks_of
+from lio_jax.pose_graph.edge_equations import blocks_of, structure_holding
 from lio_jax.pose_graph.factors import linearise
 from lio_jax.pose_graph.graph import PoseGraph, Poses
 from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError, one_thread
-from lio_jax.pose_graph.structure import structure_from, structure_of
+from lio_jax.pose_graph.structure import structure_of
 
 _Array = NDArray[np.float64]
-_Edges = tuple[Int[Array, " e"], Int[Array, " e"], Int[Array, " e"], Bool[Array, " n"]]
-"""First vertex, second vertex and kind of each edge; True for vertices that keep their pose."""
+_Edges = tuple[Int[Array, " e"], Int[Array, " e"], Bool[Array, " n"]]
+"""First and second vertex of each edge; True for vertices that keep their pose."""
 
 
 def log_determinant(poses: Poses, graph: PoseGraph) -> Float[Array, ""]:
@@ -37,14 +37,13 @@ def log_determinant(poses: Poses, graph: PoseGraph) -> Float[Array, ""]:
         The logarithm, for perturbations in rad and m; NaN where H is not positive definite.
     """
     held = jax.device_put(structure_of(graph).held)
-    return _log_determinant((graph.i, graph.j, graph.kind, held), _edge_blocks(poses, graph))
+    return _log_determinant((graph.i, graph.j, held), _edge_blocks(poses, graph))
 
 
 @jax.jit
 def _edge_blocks(poses: Poses, graph: PoseGraph) -> Float[Array, "e h h"]:
     """Return each edge's part of H by the steps of its first and second vertex."""
-    part = linearise(poses, graph)
-    return jnp.block([[part.H_ii, part.H_ij], [jnp.swapaxes(part.H_ij, -1, -2), part.H_jj]])
+    return linearise(poses, graph).blocks()
 
 
 @jax.custom_jvp
@@ -68,13 +67,10 @@ def _with_inverse(
     return jax.pure_callback(_on_host, shapes, *edges, blocks, vmap_method="sequential")
 
 
-def _on_host(
-    i: ArrayLike, j: ArrayLike, kind: ArrayLike, held: ArrayLike, blocks: ArrayLike
-) -> tuple[NDArray, NDArray]:
+def _on_host(i: ArrayLike, j: ArrayLike, held: ArrayLike, blocks: ArrayLike) -> tuple[NDArray, NDArray]:
     edges, dtype = np.asarray(blocks, np.float64), np.asarray(blocks).dtype
     size = edges.shape[-1] // 2
-    i, j, kind = (np.asarray(leaf, np.int64) for leaf in (i, j, kind))
-    structure = structure_from(i, j, kind, np.asarray(held), size)
+    structure = structure_holding(np.asarray(i), np.asarray(j), np.asarray(held), size)
     if not structure.count:
         return np.zeros((), dtype), np.zeros(edges.shape, dtype)
     try:

@@ -100,8 +100,7 @@ def descended(graph: PoseGraph, held: Bool[Array, " n"], limits: Limits) -> Pose
         scale = zero.at[graph.i].add(_diagonal(parts.H_ii)).at[graph.j].add(_diagonal(parts.H_jj))
         scale = jnp.where(free, scale, 0.0)
         added = search.damping * jnp.maximum(scale, LEAST_SCALE * jnp.max(scale))
-        blocks = jnp.block([[parts.H_ii, parts.H_ij], [jnp.swapaxes(parts.H_ij, -1, -2), parts.H_jj]])
-        step = EdgeEquations(graph.i, graph.j, held, blocks, added).solved(-g)
+        step = EdgeEquations(graph.i, graph.j, held, parts.blocks(), added).solved(-g)
         promised = (-jnp.sum(g * step) + jnp.sum(added * step**2)) / 2
         return search._replace(
             step=step,

@@ -107,8 +107,7 @@ def placed(state: InertialState, T_world_imu: jaxlie.SE3) -> InertialState:
     basis = sphere_basis(nav.gravity)
     carried = jnp.eye(DOF, dtype=turn.dtype).at[GRAVITY, GRAVITY].set(basis.T @ turn @ basis)
     covariance = recipe.placed_covariance(carried @ state.covariance @ carried.T)
-    moved = eqx.tree_at(lambda one: (one.T_world_imu, one.velocity), nav, (T_world_imu, turn @ nav.velocity))
-    return eqx.tree_at(lambda one: (one.nav, one.covariance), state, (moved, covariance))
+    return eqx.tree_at(lambda one: (one.nav, one.covariance), state, (nav.at_pose(T_world_imu), covariance))
 
 
 def step(

@@ -84,13 +84,11 @@ def placed(state: LidarState, T_world_imu: jaxlie.SE3) -> LidarState:
         state: of :func:`init`.
         T_world_imu: in the map's world, whose z axis points upwards.
     """
-    nav = state.nav
-    turn = T_world_imu.rotation() @ nav.T_world_imu.rotation().inverse()
-    moved = dataclasses.replace(nav, T_world_imu=T_world_imu, velocity=turn @ nav.velocity)
+    nav, covariance = state.nav, recipe.placed_covariance(state.uncertain.covariance)
     return eqx.tree_at(
         lambda one: (one.nav, one.T_world_lidar, one.uncertain.covariance),
         state,
-        (moved, T_world_imu @ nav.T_imu_lidar, recipe.placed_covariance(state.uncertain.covariance)),
+        (nav.at_pose(T_world_imu), T_world_imu @ nav.T_imu_lidar, covariance),
     )
 
 

@@ -189,11 +189,7 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
             T_new_old: moves the vehicle, m; its rotation is about the vertical.
             keyframes: new T_world_lidar of the submap's k rows, m; those of free rows have no effect.
         """
-        nav = dataclasses.replace(
-            state.nav,
-            T_world_imu=T_new_old @ state.nav.T_world_imu,
-            velocity=T_new_old.rotation() @ state.nav.velocity,
-        )
+        nav = state.nav.at_pose(T_new_old @ state.nav.T_world_imu)
         submap = rebuilt(
             state.map, keyframes, lidar_pose(nav), state.time, params.map, params.point_map, params.submap
         )

@@ -70,16 +70,18 @@ class LocalisingStep(CompiledStep):
         self.start = start
         self._T_world_imu = jaxlie.SE3.from_matrix(jnp.asarray(start.T_world_imu, state_dtype()))
         self._placed = programs(type(self.recipe).placed, self.recipe, donate=(1,))
-        self._pager = MapPager(known, self.recipe, self.params, start.T_world_imu[:3, 3])
+        self._known = known
+        self._first = self.pager()
 
     def init(self, imu: ImuBatch | None, velocity: NDArray[np.float64] | None = None) -> Any:
         """Return the state before the first scan: at its pose in the map, with the map around it."""
         state = super().init(imu, velocity)
-        return self._pager.filled(self._placed(self.params, state, self._T_world_imu))
+        return self._first.filled(self._placed(self.params, state, self._T_world_imu))
 
     def pager(self) -> MapPager:
-        """Return what hands the map over during the run."""
-        return self._pager
+        """Return what hands the map over during a new run."""
+        assert isinstance(self.recipe, LocalisingRecipe)
+        return MapPager(self._known, self.recipe, self.params, self.start.T_world_imu[:3, 3])
 
 
 def step_of(sequence: Sequence, settings: Settings, imu: ImuData | None, first: int = 0) -> CompiledStep:
