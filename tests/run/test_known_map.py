@@ -3,13 +3,16 @@
 import json
 from dataclasses import replace
 
+import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lio_jax.core.error_state import sphere_basis
 from lio_jax.core.errors import LioJaxError, UsageError
+from lio_jax.core.geometry import rotation_matrix
 from lio_jax.mapping.voxel_map import FREE
 from lio_jax.recipes.recipe import LocalisingRecipe
 from lio_jax.run import known_map
@@ -20,7 +23,7 @@ from lio_jax.run.pushed import PushedOdometry
 from lio_jax.run.run import run_sequence, settings_for
 from lio_jax.run.scan_inputs import feed_of
 from lio_jax.run.track import CompiledStep
-from lio_jax.settings.settings import recipe_of, recipe_settings, with_overrides
+from lio_jax.settings.settings import recipe_of, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.tuning.gradient import gradient
 from tests.run import inertial_drive
 from tests.run.inertial_drive import InertialReplay, errors
@@ -119,6 +122,27 @@ def test_a_killed_run_goes_on_with_the_same_parts_of_the_map(tmp_path, recording
         assert contents(folder) == whole
 
 
+def test_an_imu_that_is_mounted_askew_finds_its_attitude(recording, resolved, earlier):
+    """The same drive, as an IMU records it that is tilted by a quarter of a radian."""
+    R = Rotation.from_euler("xyz", [0.2, -0.15, 0.6]).as_matrix()
+    askew = np.eye(4)
+    askew[:3, :3] = R
+    samples = recording.imu()
+    samples = replace(samples, gyro=samples.gyro @ R, accel=samples.accel @ R)
+    T_imu_lidar = np.linalg.inv(askew) @ inertial_drive.drive().info.T_imu_lidar
+    settings = with_overrides(resolved, near(earlier[1], LATER, (1.0, -1.0, 0.0)))
+    # the heading of the tilted axes
+    expected = earlier[1].poses[LATER] @ askew
+    heading = np.arctan2(expected[1, 0], expected[0, 0])
+    settings = with_extrinsics(
+        with_overrides(settings, [f"params.known_map.heading={heading:.3f}"]), T_imu_lidar, "the test"
+    )
+    start = localise(recording, KnownMap.read(earlier[0]), settings, samples, first=LATER)
+    off = np.linalg.inv(expected) @ start.T_world_imu
+    assert np.linalg.norm(Rotation.from_matrix(off[:3, :3]).as_rotvec()) < 0.03
+    assert np.linalg.norm(off[:3, 3]) < 0.5
+
+
 def test_places_and_ways_that_do_not_fit_are_named(tmp_path, recording, known, resolved, earlier):
     def fails(error, words, *extra):
         with pytest.raises(error, match=words):
@@ -164,24 +188,33 @@ def test_the_pager_hands_over_each_tile_once_and_again_after_it_was_left(monkeyp
     rng = np.random.default_rng(0)
     x = np.linspace(0, 400, 40001)
     points = np.stack([x, rng.uniform(-5, 5, len(x)), rng.uniform(0, 3, len(x))], -1)
-    taken = []
+    ways = np.arange(0, 300, 2.0), np.arange(300, 0, -2.0)
+    handed = [[]]
 
     def counted(params, state, points, mask, origin):
-        taken.append(points[mask] + origin)
+        handed[-1].append(points[mask] + origin)
         return state
 
     settings = with_overrides(recipe_settings("default"), ["params.map.reach=40"])
     pager = MapPager(KnownMap(points), recipe_of(settings), settings.params(), np.zeros(3))
     monkeypatch.setattr(pager, "_program", counted)
     pager.filled(None)
-    for position in [*np.arange(0, 300, 2.0), *np.arange(300, 0, -2.0)]:
-        pager.moved_to(np.array([position, 0.0, 0.0]))
-        pager.paged(None)
-        held = np.concatenate(taken)[:, 0]
-        ahead = held[np.abs(held - position) < 10]
-        assert len(np.unique(ahead.round(3))) >= 1900 * (min(position + 10, 400) - max(position - 10, 0)) / 20
-    # there and back: each tile came twice at most, but for those near the turning point
-    assert len(np.concatenate(taken)) < 2 * len(points)
+    for back, way in enumerate(ways):
+        handed += [[]] * back
+        for position in way:
+            pager.moved_to(np.array([position, 0.0, 0.0]))
+            pager.paged(None)
+            # the way back begins among tiles that are still held
+            if back and position > 200:
+                continue
+            held = np.concatenate(handed[-1])[:, 0]
+            ahead = held[np.abs(held - position) < 10]
+            expected = min(position + 10, 400) - max(position - 10, 0)
+            assert len(np.unique(ahead.round(3))) >= 1900 * expected / 20
+    # no tile comes twice on one way
+    for parts in handed:
+        together = np.concatenate(parts)
+        assert len(np.unique(together, axis=0)) == len(together)
 
 
 def test_a_start_in_a_map_keeps_the_errors_in_the_body_s_axes(recording, resolved):
@@ -189,7 +222,8 @@ def test_a_start_in_a_map_keeps_the_errors_in_the_body_s_axes(recording, resolve
     recipe = recipe_of(resolved)
     assert isinstance(recipe, LocalisingRecipe)
     params = resolved.params()
-    before = _first_state(resolved, recording)
+    still = _first_state(resolved, recording)
+    before = eqx.tree_at(lambda state: state.nav.velocity, still, jnp.array([3.0, -1.0, 0.2]))
     turned = jaxlie.SE3.from_rotation_and_translation(
         jaxlie.SO3.from_z_radians(1.1), jnp.array([30.0, -4.0, 2.0])
     )
@@ -197,10 +231,18 @@ def test_a_start_in_a_map_keeps_the_errors_in_the_body_s_axes(recording, resolve
     here, there = recipe.placed(params, before, T), recipe.placed(params, before, turned @ T)
     np.testing.assert_allclose(there.covariance[:15, :15], here.covariance[:15, :15], atol=1e-12)
     np.testing.assert_allclose(there.nav.velocity, turned.rotation() @ here.nav.velocity, atol=1e-12)
-    # gravity's axes are the world's: the variance of its direction stays, its axes turn
-    np.testing.assert_allclose(
-        np.linalg.eigvalsh(there.covariance), np.linalg.eigvalsh(here.covariance), rtol=1e-9, atol=1e-15
-    )
+    # seen from the body, the direction of gravity has the same errors, correlated with the same others
+    body = [
+        np.asarray(rotation_matrix(one.nav.T_world_imu.rotation()).T @ sphere_basis(one.nav.gravity))
+        for one in (here, there)
+    ]
+    others = np.r_[0:15, 17:24]
+    for turn, one in zip(body, (here, there), strict=True):
+        fall = turn @ np.asarray(one.covariance)[15:17]
+        found = np.concatenate([fall[:, others], fall[:, 15:17] @ turn.T], axis=1)
+        expected = found if one is here else expected
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert np.abs(expected).max() > 1e-7
     assert np.all(np.diag(here.covariance)[:6] > np.diag(before.covariance)[:6])
 
 
