@@ -108,7 +108,7 @@ class KnownMapParams(eqx.Module):
     """Heading of the IMU's x axis at the first scan, from the map's x axis, counterclockwise."""
     position_error: Scalar = leaf(5.0, "m", above=0, most=15)
     """Largest horizontal error of ``position``."""
-    heading_error: Scalar = leaf(0.5, "rad", above=0)
+    heading_error: Scalar = leaf(0.5, "rad", above=0, most=3.15)
     """Largest error of ``heading``; 3.15 tries all headings."""
 
 
