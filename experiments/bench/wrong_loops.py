@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from lio_jax.pose_graph.graph import PoseGraph
 
 KINDS = ("copied", "grouped", "random")
-RECORDED = ("sphere2500", "parking-garage", "M3500")
+RECORDED = ("sphere2500", "parking-garage", "M3500", "intel", "MIT")
 _GROUP = 5
 
 

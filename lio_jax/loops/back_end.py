@@ -150,9 +150,9 @@ def solved(poses: _Array, edges: list[Edge]) -> Solved:
     """Return the poses that agree best with the edges.
 
     A first solve trusts all edges, which is many times faster. A robust solve follows only if an edge then
-    has an improbable residual; it may reject loops and positions. In it the odometry has less information:
-    its errors are correlated, so correct loops may all contradict it in the same way and must not be
-    rejected.
+    has an improbable residual, or all edges together; it may reject loops and positions. In it the odometry
+    has less information: its errors are correlated, so correct loops may all contradict it in the same way
+    and must not be rejected.
 
     Args:
         poses: (k, 4, 4) first guess of T_world_keyframe, m. Without a prior or a position the first pose does
@@ -163,8 +163,12 @@ def solved(poses: _Array, edges: list[Edge]) -> Solved:
     plain = solve(graph, start="poses")
     kind = np.array([edge.kind for edge in edges])
     doubted = (kind == LOOP) | (kind == POSITION)
-    limit = chi2.isf(_SUSPICIOUS, np.where(kind == POSITION, 3, 6))
-    if not np.any(doubted & (2 * np.asarray(plain.edge_costs) > limit)):
+    freedom = np.where(kind == POSITION, 3, 6)
+    squared = 2 * np.asarray(plain.edge_costs)
+    # a wrong loop may bend the odometry until it agrees: the odometry's share tells it, as loose as below
+    together = squared[doubted].sum() + squared[~doubted].sum() / _SYSTEMATIC**2
+    improbable = together > chi2.isf(_SUSPICIOUS, max(freedom[doubted].sum(), 1))
+    if not improbable and not np.any(squared[doubted] > chi2.isf(_SUSPICIOUS, freedom[doubted])):
         return Solved(matrices_of(plain.poses), np.ones(len(edges)))
     loose = [
         replace(edge, information=edge.information / _SYSTEMATIC**2) if edge.kind == ODOMETRY else edge

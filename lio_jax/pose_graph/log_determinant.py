@@ -13,7 +13,7 @@ from lio_jax.pose_graph.edge_equations import blocks_of, structure_holding
 from lio_jax.pose_graph.factors import linearise
 from lio_jax.pose_graph.graph import PoseGraph, Poses
 from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError, one_thread
-from lio_jax.pose_graph.structure import structure_of
+from lio_jax.pose_graph.structure import Structure, structure_of
 
 _Array = NDArray[np.float64]
 _Edges = tuple[Int[Array, " e"], Int[Array, " e"], Bool[Array, " n"]]
@@ -76,16 +76,9 @@ def _on_host(i: ArrayLike, j: ArrayLike, held: ArrayLike, blocks: ArrayLike) -> 
     try:
         with one_thread():
             factor = factorise(structure.plan, *blocks_of(structure, edges))
-            diagonal, pairs = inverse_blocks(factor)
+            inverse = inverse_at_edges(structure, factor)
     except NotPositiveDefiniteError:
         return np.full((), np.nan, dtype), np.full(edges.shape, np.nan, dtype)
-    none = np.zeros((1, size, size))
-    diagonal, pairs = np.concatenate([diagonal, none]), np.concatenate([pairs, none])
-    first, second = structure.unknown[structure.i], structure.unknown[structure.j]
-    between = pairs[structure.pair_of]
-    turned = between.transpose(0, 2, 1)
-    between = np.where((first < second)[:, None, None], turned, between)
-    inverse = np.block([[diagonal[first], between], [between.transpose(0, 2, 1), diagonal[second]]])
     return np.asarray(log_determinant_of(factor), dtype), inverse.astype(dtype)
 
 
@@ -99,6 +92,24 @@ def log_determinant_of(factor: ChainFactor) -> float:
     # the levels hold the inverse of the factor's own blocks
     diagonals += [1 / np.diagonal(level.root, axis1=1, axis2=2) for level in factor.levels]
     return 2 * sum(float(np.sum(np.log(diagonal))) for diagonal in diagonals)
+
+
+def inverse_at_edges(structure: Structure, factor: ChainFactor) -> _Array:
+    """Return the rows and columns of a Hessian's inverse of each edge's two vertices, (e, 2 d, 2 d).
+
+    Args:
+        structure: structure of the graph.
+        factor: Cholesky factor of the Hessian of its used edges.
+
+    Returns:
+        The blocks; zero for held vertices. Those between the vertices of an unused edge are zero, too.
+    """
+    none = np.zeros((1, structure.tangent_size, structure.tangent_size))
+    diagonal, pairs = (np.concatenate([blocks, none]) for blocks in inverse_blocks(factor))
+    first, second = structure.unknown[structure.i], structure.unknown[structure.j]
+    between = pairs[structure.pair_of]
+    between = np.where((first < second)[:, None, None], between.transpose(0, 2, 1), between)
+    return np.block([[diagonal[first], between], [between.transpose(0, 2, 1), diagonal[second]]])
 
 
 def inverse_blocks(factor: ChainFactor) -> tuple[_Array, _Array]:

@@ -7,6 +7,10 @@ with anything. Loops are accepted in the order of that chance, as long as few of
 to be wrong. Each acceptance makes the graph stiffer and the next loops easier to judge. Accepted loops that
 the solution contradicts are dropped again.
 
+A few loops are all tried together first. A few tight loops can bend a loose odometry until every one of them
+agrees, so the whole cost has to be as low as its degrees of freedom allow. If it is not, the loops are judged
+by their innovations from the trusted edges alone, which no wrong loop has bent yet.
+
 The idea to accept measurements by their joint consistency is that of Neira & Tardos, "Data association in
 stochastic mapping using the joint compatibility test", T-RA 2001, and of Latif, Cadena & Neira, "Robust loop
 closing over time for pose graph SLAM", IJRR 2013. The order by the chance of a false agreement is our own.
@@ -15,6 +19,7 @@ closing over time for pose graph SLAM", IJRR 2013. The order by the chance of a 
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from math import ceil
 from typing import NamedTuple
 
 import equinox as eqx
@@ -37,9 +42,10 @@ from lio_jax.pose_graph.descent import (
 )
 from lio_jax.pose_graph.factors import residuals
 from lio_jax.pose_graph.graph import PoseGraph, Poses, picked
+from lio_jax.pose_graph.leave_one_out import falls_without
 from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError
 from lio_jax.pose_graph.path_covariance import path_covariances
-from lio_jax.pose_graph.structure import Structure
+from lio_jax.pose_graph.structure import Structure, structure_of
 
 _Array = NDArray[np.float64]
 
@@ -56,6 +62,11 @@ _CHANCES = 2
 _FEW = 0.25
 """Number of doubted edges, over that of the trusted ones, up to which all are tried at once: many wrong loops
 would couple everything with everything, and the solve would take long."""
+_ENOUGH_FOR_SCALE = 5
+"""Least number of loops whose innovations tell how much larger the trusted edges' noise is than stated."""
+_LEFT_OUT = 0.1, 5
+"""Largest share and number of a few loops that are left out one after the other, each time the worst one.
+Where more are wrong, they hide each other."""
 _ON_THE_WAY = Limits(iterations=50, tolerance=1e-4)
 """Conditions that end the descents before the last one."""
 _WORST = 0.25
@@ -112,14 +123,12 @@ def select(
     """
     problem = _Problem(graph, structure, padded, doubted, confidence)
     state = _State(~doubted, poses, 1.0, 0)
-    together = _all_agree(problem, state) if np.sum(doubted) <= _FEW * np.sum(~doubted) else None
-    if together is not None:
-        state = together
-    else:
-        # a damaged file may place vertices beyond all numbers
-        with np.errstate(over="ignore", invalid="ignore"):
-            state = _grown(problem, state, _EXPECTED_WRONG, stated=False)
-            state = _grown(problem, state._replace(variance=1.0), _EXPECTED_WRONG_AS_STATED, stated=True)
+    # a damaged file may place vertices beyond all numbers
+    with np.errstate(over="ignore", invalid="ignore"):
+        judged, few = _few(problem, state) if np.sum(doubted) <= _FEW * np.sum(~doubted) else (problem, None)
+        state = few if few is not None else _grown(problem, state, _EXPECTED_WRONG, stated=False)
+        if not np.all(state.kept):
+            state = _grown(judged, state._replace(variance=1.0), _EXPECTED_WRONG_AS_STATED, stated=True)
     descent = _solved(problem, state.kept, state.poses, limits, anew=False)
     iterations = state.iterations + descent.iterations
     return descent._replace(iterations=iterations), state.kept.astype(np.float64)
@@ -188,14 +197,85 @@ class _Innovations(NamedTuple):
         return np.nan_to_num(np.exp(np.minimum(volume + among / 2, 0.0)), nan=1.0)
 
 
-def _all_agree(problem: _Problem, state: _State) -> _State | None:
-    """Return the state with all edges; None if one of them contradicts the others."""
-    kept = np.ones(len(state.kept), bool)
+def _few(problem: _Problem, state: _State) -> tuple[_Problem, _State | None]:
+    """Accept all loops, or those that the trusted edges allow.
+
+    Most of the loops are taken to be right: if their innovations are larger than stated, it is the trusted
+    edges that are less certain than they state. Fewer than five loops do not tell that.
+
+    Returns:
+        The graph with the information of the trusted edges by which its loops were judged, and the state with
+        the accepted loops; None if neither all of them agree nor almost all that the trusted edges allow.
+    """
+    loops = np.flatnonzero(problem.doubted)
+    innovations = _innovations(problem, state, loops).squared
+    scale = np.sort(innovations)[(len(loops) - 1) // 2] / chi2.median(problem.size)
+    if len(loops) >= _ENOUGH_FOR_SCALE and 1.0 < scale < np.inf:
+        problem = _loosened(problem, scale)
+        innovations = _innovations(problem, state, loops).squared
+    after, squared = _with(problem, state, loops)
+    if _agree(problem, after, squared):
+        return problem, after
+    return problem, _without_the_worst(problem, state, loops[innovations <= problem.limit])
+
+
+def _loosened(problem: _Problem, scale: float) -> _Problem:
+    """Return the problem with the information of its trusted edges divided by a scale."""
+
+    def loose(graph: PoseGraph) -> PoseGraph:
+        by = np.ones(len(graph.i))
+        by[: len(problem.doubted)][~problem.doubted] = 1 / scale
+        return eqx.tree_at(lambda graph: graph.information, graph, graph.information * by[:, None, None])
+
+    padded = problem.padded._replace(graph=loose(problem.padded.graph))
+    return _Problem(loose(problem.graph), problem.structure, padded, problem.doubted, problem.confidence)
+
+
+def _with(problem: _Problem, state: _State, loops: NDArray[np.int64]) -> tuple[_State, _Array]:
+    """Return the state with some loops more, and r' Omega r of all edges."""
+    kept = state.kept.copy()
+    kept[loops] = True
     descent = _solved(problem, kept, state.poses, _ON_THE_WAY, anew=True)
     squared = 2 * np.asarray(descent.point.edge_costs)[: len(kept)]
-    if np.any(squared[problem.doubted] > problem.limit):
-        return None
-    return _State(kept, descent.point.poses, 1.0, descent.iterations)
+    return _State(kept, descent.point.poses, state.variance, state.iterations + descent.iterations), squared
+
+
+def _freedom(problem: _Problem, state: _State) -> int:
+    """Return the degrees of freedom of the sum of all r' Omega r; at least 1."""
+    return max(problem.size * int(np.sum(state.kept) - problem.structure.count), 1)
+
+
+def _agree(problem: _Problem, state: _State, squared: _Array) -> bool:
+    """Return whether no accepted loop contradicts the others, and all edges agree together."""
+    most = float(chi2.ppf(problem.confidence, _freedom(problem, state)))
+    worst = squared[problem.doubted & state.kept].max(initial=0.0)
+    return bool(worst <= problem.limit and squared[state.kept].sum() <= most)
+
+
+def _without_the_worst(problem: _Problem, state: _State, loops: NDArray[np.int64]) -> _State | None:
+    """Return the state with some loops but the worst of them; None if too many would have to go.
+
+    The worst one is that without which the cost falls most. Its fall is its squared innovation from all other
+    edges, so the largest fall has to agree with their noise, which may be smaller than stated.
+    """
+    share, most = _LEFT_OUT
+    for _ in range(1 + min(ceil(share * len(loops)), most)):
+        if not len(loops):
+            return state
+        after, squared = _with(problem, state, loops)
+        chain = structure_of(problem.graph, after.kept)
+        try:
+            falls = falls_without(after.poses, problem.padded.graph, chain, after.kept, loops)
+        except (NotPositiveDefiniteError, np.linalg.LinAlgError):
+            return None
+        freedom = _freedom(problem, after)
+        variance = min(1.0, float(squared[after.kept].sum() + _STATED) / (freedom + _STATED))
+        limit = chi2.isf((1 - problem.confidence) / len(loops), problem.size)
+        if falls.max() <= limit * variance and _agree(problem, after, squared):
+            return after
+        loops = np.delete(loops, np.argmax(falls))
+        state = state._replace(poses=after.poses, iterations=after.iterations)
+    return None
 
 
 def _grown(problem: _Problem, state: _State, shares: tuple[float, ...], stated: bool) -> _State:

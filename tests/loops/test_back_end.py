@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lio_jax.loops.back_end import BackEnd, corrected_poses, levelled_onto
+from lio_jax.loops.back_end import BackEnd, Edge, corrected_poses, levelled_onto, solved
 from lio_jax.loops.gps import GpsGate
 from lio_jax.loops.keyframe import Keyframe
 from lio_jax.loops.proposals import Proposal
 from lio_jax.loops.verification import Verdict
+from lio_jax.pose_graph.graph import LOOP, ODOMETRY
 from lio_jax.settings.settings import Settings
 from tests.loops.drives import LEVER, SHIFT, SPEED, YAW, poses_at, to_enu
 
@@ -174,3 +175,18 @@ def test_a_level_frame_is_laid_onto_another(yaw):
     tilted[:3, :3] = Rotation.from_euler("x", 0.05).as_matrix() @ pose[:3, :3]
     found = levelled_onto(tilted, turn @ pose)
     np.testing.assert_allclose(found[2, :3], [0, 0, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize(("wrong_by", "weight"), [(0.0, 1.0), (40.0, 0.0)])
+def test_a_loop_that_only_bends_the_odometry_is_rejected(wrong_by, weight):
+    """The odometry states so little that it can follow the loop; no edge is improbable by itself."""
+    poses = np.tile(np.eye(4), (21, 1, 1))
+    poses[:, 0, 3] = np.arange(21.0)
+    step, whole = poses[1], poses[20].copy()
+    whole[1, 3] += wrong_by
+    loose, tight = (np.diag(np.repeat([rad, m], 3) ** -2.0) for rad, m in ((0.02, 0.2), (0.002, 0.05)))
+    edges = [Edge(ODOMETRY, k, k + 1, step, loose) for k in range(20)]
+    edges.append(Edge(LOOP, 0, 20, whole, tight))
+    found = solved(poses, edges)
+    assert found.weights[-1] == weight
+    np.testing.assert_allclose(found.poses, poses, atol=1e-6)

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.pose_graph.chordal import edges_at
 from lio_jax.pose_graph.graph import LOOP, numbers_of, poses_from, translations
+from lio_jax.pose_graph.leave_one_out import falls_without
 from lio_jax.pose_graph.path_covariance import path_covariances
 from lio_jax.pose_graph.pose_graph import marginal_covariances, solve
 from lio_jax.pose_graph.robust import Robust
@@ -80,6 +81,53 @@ def test_the_noise_may_be_smaller_than_stated(factor):
     print(np.sum(weights[: len(clean.i)] == 0), np.sum(weights[len(clean.i) :]))
     assert np.all(weights[: len(clean.i)] == 1)
     assert np.all(weights[len(clean.i) :] == 0)
+
+
+def few_loops(right, sure, rng):
+    """Return a lap and a half with a few right loops; its odometry states 1 / sure of its true sigmas."""
+    truth = at(laps(jaxlie.SE3), slice(3 * PER_LAP // 2))
+    first = rng.choice(PER_LAP // 2 - 4, right, replace=False) + 2
+    pairs = np.stack([first, first + PER_LAP + rng.integers(-2, 3, right)], -1)
+    sigma = np.array([0.004] * 3 + [0.04] * 3)
+    graph = graph_of(truth, pairs, rng, information=np.tile(np.diag(sigma**-2), (149 + right, 1, 1)))
+    scale = np.where(np.asarray(graph.kind) == LOOP, 1.0, sure**2)[:, None, None]
+    return eqx.tree_at(lambda graph: graph.information, graph, graph.information * scale)
+
+
+def across(graph, count, rng):
+    """Return the graph with wrong loops between opposite places of the course, 25 m apart."""
+    first = rng.choice(90, count, replace=False)
+    source = rng.choice(np.flatnonzero(np.asarray(graph.kind) == LOOP), count)
+    measured, information = at(graph.measurement, source), np.asarray(graph.information)[source]
+    return with_edges(graph, first, first + PER_LAP // 2, measured, information, LOOP)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "sure"),
+    [(1, 0, 1), (1, 1, 0.2), (3, 1, 0.2), (5, 2, 0.2), (20, 5, 0.2), (5, 2, 1), (12, 5, 5)],
+)
+def test_a_few_loops_do_not_bend_the_odometry(right, wrong, sure):
+    """With tight loops and a loose odometry, the odometry bends until all edges agree one by one."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        clean = few_loops(right, sure, rng)
+        graph = across(clean, wrong, rng)
+        weights = np.asarray(solve(graph, robust=Robust()).weights)
+        assert np.all(weights[: len(clean.i)] == 1)
+        assert np.all(weights[len(clean.i) :] == 0)
+
+
+@pytest.mark.parametrize("group", [jaxlie.SE3, jaxlie.SE2], ids=["space", "plane"])
+def test_the_fall_without_a_loop_is_that_of_a_new_solve(group):
+    rng = np.random.default_rng(1)
+    graph = graph_of(walk(group, 40, rng), [(0, 12), (3, 39), (5, 30), (6, 31)], rng, noise=1e-3)
+    solution = solve(graph, start="poses")
+    used, loops = np.ones(len(graph.i), bool), np.flatnonzero(np.asarray(graph.kind) == LOOP)
+    found = falls_without(solution.poses, graph, structure_of(graph), used, loops)
+    whole = 2 * np.sum(np.asarray(solution.edge_costs))
+    for loop, fall in zip(loops, found, strict=True):
+        rest = edges_at(graph, np.flatnonzero(np.arange(len(graph.i)) != loop))
+        assert fall == pytest.approx(whole - 2 * np.sum(np.asarray(solve(rest).edge_costs)), rel=1e-3)
 
 
 @pytest.mark.parametrize("group", [jaxlie.SE3, jaxlie.SE2], ids=["space", "plane"])
