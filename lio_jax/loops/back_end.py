@@ -150,7 +150,7 @@ def solved(poses: _Array, edges: list[Edge]) -> Solved:
     """Return the poses that agree best with the edges.
 
     A first solve trusts all edges, which is many times faster. A robust solve follows only if an edge then
-    has an improbable residual, or all edges together; it may reject loops and positions. In it the odometry
+    has an improbable residual, or the odometry is bent; it may reject loops and positions. In it the odometry
     has less information: its errors are correlated, so correct loops may all contradict it in the same way
     and must not be rejected.
 
@@ -165,10 +165,9 @@ def solved(poses: _Array, edges: list[Edge]) -> Solved:
     doubted = (kind == LOOP) | (kind == POSITION)
     freedom = np.where(kind == POSITION, 3, 6)
     squared = 2 * np.asarray(plain.edge_costs)
-    # a wrong loop may bend the odometry until it agrees: the odometry's share tells it, as loose as below
-    together = squared[doubted].sum() + squared[~doubted].sum() / _SYSTEMATIC**2
-    improbable = together > chi2.isf(_SUSPICIOUS, max(freedom[doubted].sum(), 1))
-    if not improbable and not np.any(squared[doubted] > chi2.isf(_SUSPICIOUS, freedom[doubted])):
+    # a wrong loop may bend the odometry until it agrees, so the odometry's own share must be probable, too
+    bent = squared[~doubted].sum() / _SYSTEMATIC**2 > chi2.isf(_SUSPICIOUS, max(freedom[doubted].sum(), 1))
+    if not bent and not np.any(squared[doubted] > chi2.isf(_SUSPICIOUS, freedom[doubted])):
         return Solved(matrices_of(plain.poses), np.ones(len(edges)))
     loose = [
         replace(edge, information=edge.information / _SYSTEMATIC**2) if edge.kind == ODOMETRY else edge

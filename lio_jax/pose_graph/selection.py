@@ -8,8 +8,8 @@ to be wrong. Each acceptance makes the graph stiffer and the next loops easier t
 the solution contradicts are dropped again.
 
 A few loops are all tried together first. A few tight loops can bend a loose odometry until every one of them
-agrees, so the whole cost has to be as low as its degrees of freedom allow. If it is not, the loops are judged
-by their innovations from the trusted edges alone, which no wrong loop has bent yet.
+agrees, so the odometry's own cost has to be as low as the degrees of freedom allow. If it is not, the loops
+are judged by their innovations from the trusted edges alone, which no wrong loop has bent yet.
 
 The idea to accept measurements by their joint consistency is that of Neira & Tardos, "Data association in
 stochastic mapping using the joint compatibility test", T-RA 2001, and of Latif, Cadena & Neira, "Robust loop
@@ -246,10 +246,13 @@ def _freedom(problem: _Problem, state: _State) -> int:
 
 
 def _agree(problem: _Problem, state: _State, squared: _Array) -> bool:
-    """Return whether no accepted loop contradicts the others, and all edges agree together."""
+    """Return whether no accepted loop contradicts the others, and the loops did not bend the trusted edges.
+
+    Right loops leave the trusted edges a sum of squares below that of all degrees of freedom.
+    """
     most = float(chi2.ppf(problem.confidence, _freedom(problem, state)))
     worst = squared[problem.doubted & state.kept].max(initial=0.0)
-    return bool(worst <= problem.limit and squared[state.kept].sum() <= most)
+    return bool(worst <= problem.limit and squared[~problem.doubted].sum() <= most)
 
 
 def _without_the_worst(problem: _Problem, state: _State, loops: NDArray[np.int64]) -> _State | None:

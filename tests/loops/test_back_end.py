@@ -177,7 +177,7 @@ def test_a_level_frame_is_laid_onto_another(yaw):
     np.testing.assert_allclose(found[2, :3], [0, 0, 1], atol=1e-12)
 
 
-@pytest.mark.parametrize(("wrong_by", "weight"), [(0.0, 1.0), (40.0, 0.0)])
+@pytest.mark.parametrize(("wrong_by", "weight"), [(0.0, 1.0), (45.0, 0.0)])
 def test_a_loop_that_only_bends_the_odometry_is_rejected(wrong_by, weight):
     """The odometry states so little that it can follow the loop; no edge is improbable by itself."""
     poses = np.tile(np.eye(4), (21, 1, 1))
