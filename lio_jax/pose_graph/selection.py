@@ -64,6 +64,11 @@ _FEW = 0.25
 would couple everything with everything, and the solve would take long."""
 _ENOUGH_FOR_SCALE = 5
 """Least number of loops whose innovations tell how much larger the trusted edges' noise is than stated."""
+_MANY_MORE = 1.1
+"""Loops that the trusted edges allow are taken if there are this many times more than can be told from wrong
+ones: a group of wrong ones that agree with each other may be among them."""
+_SURELY_RIGHT = 0.5
+"""Share of the loops that are right, and agree best, in the estimate of that noise."""
 _LEFT_OUT = 0.1, 5
 """Largest share and number of a few loops that are left out one after the other, each time the worst one.
 Where more are wrong, they hide each other."""
@@ -123,12 +128,10 @@ def select(
     """
     problem = _Problem(graph, structure, padded, doubted, confidence)
     state = _State(~doubted, poses, 1.0, 0)
+    few = np.sum(doubted) <= _FEW * np.sum(~doubted)
     # a damaged file may place vertices beyond all numbers
     with np.errstate(over="ignore", invalid="ignore"):
-        judged, few = _few(problem, state) if np.sum(doubted) <= _FEW * np.sum(~doubted) else (problem, None)
-        state = few if few is not None else _grown(problem, state, _EXPECTED_WRONG, stated=False)
-        if not np.all(state.kept):
-            state = _grown(judged, state._replace(variance=1.0), _EXPECTED_WRONG_AS_STATED, stated=True)
+        state = _of_few(problem, state) if few else _of_many(problem, state)
     descent = _solved(problem, state.kept, state.poses, limits, anew=False)
     iterations = state.iterations + descent.iterations
     return descent._replace(iterations=iterations), state.kept.astype(np.float64)
@@ -197,26 +200,41 @@ class _Innovations(NamedTuple):
         return np.nan_to_num(np.exp(np.minimum(volume + among / 2, 0.0)), nan=1.0)
 
 
-def _few(problem: _Problem, state: _State) -> tuple[_Problem, _State | None]:
-    """Accept all loops, or those that the trusted edges allow.
+def _of_many(problem: _Problem, state: _State) -> _State:
+    """Return the state with the loops that can be told from wrong ones."""
+    state = _grown(problem, state, _EXPECTED_WRONG, stated=False)
+    return _as_stated(problem, state)
 
-    Most of the loops are taken to be right: if their innovations are larger than stated, it is the trusted
-    edges that are less certain than they state. Fewer than five loops do not tell that.
 
-    Returns:
-        The graph with the information of the trusted edges by which its loops were judged, and the state with
-        the accepted loops; None if neither all of them agree nor almost all that the trusted edges allow.
+def _as_stated(problem: _Problem, state: _State) -> _State:
+    return _grown(problem, state._replace(variance=1.0), _EXPECTED_WRONG_AS_STATED, stated=True)
+
+
+def _of_few(problem: _Problem, state: _State) -> _State:
+    """Return the state with all loops if they agree, else with those that can be told from wrong ones.
+
+    A few right loops may not support each other enough for that. Then those are taken that the trusted edges
+    allow, less the worst, if these are many more.
+
+    Half of the loops are taken to be right: if the median of their innovations is larger than stated, it is
+    the trusted edges that are less certain than they state. Fewer than five loops do not tell that.
     """
     loops = np.flatnonzero(problem.doubted)
-    innovations = _innovations(problem, state, loops).squared
-    scale = np.sort(innovations)[(len(loops) - 1) // 2] / chi2.median(problem.size)
+    judged, innovations = problem, _innovations(problem, state, loops).squared
+    scale = np.quantile(innovations, _SURELY_RIGHT / 2, method="lower") / chi2.median(problem.size)
     if len(loops) >= _ENOUGH_FOR_SCALE and 1.0 < scale < np.inf:
-        problem = _loosened(problem, scale)
-        innovations = _innovations(problem, state, loops).squared
-    after, squared = _with(problem, state, loops)
-    if _agree(problem, after, squared):
-        return problem, after
-    return problem, _without_the_worst(problem, state, loops[innovations <= problem.limit])
+        judged = _loosened(problem, scale)
+        innovations = _innovations(judged, state, loops).squared
+    after, squared = _with(judged, state, loops)
+    if _agree(judged, after, squared):
+        return after
+    told = _of_many(problem, state)
+    allowed = _without_the_worst(judged, state, loops[innovations <= problem.limit])
+    if allowed is None:
+        return told
+    allowed = _as_stated(judged, allowed)
+    counts = [np.sum(each.kept[loops]) for each in (allowed, told)]
+    return allowed if counts[0] > _MANY_MORE * counts[1] else told
 
 
 def _loosened(problem: _Problem, scale: float) -> _Problem:
