@@ -176,7 +176,7 @@ def _tuned(path: Path, true: dict[str, float]) -> dict[str, list[float]]:
 def _intervals(history: Any, true: dict[str, float]) -> dict[str, list[float]]:
     best = min(history["iterates"], key=lambda iterate: iterate["value"])
     found = {}
-    for name, x, sigma in zip(history["parameters"], best["x"], best["sigma"], strict=True):
+    for name, x, sigma in zip(history["names"], best["x"], best["sigma"], strict=True):
         name = name.removeprefix("params.")
         if name in true:
             found[name] = [float(np.exp(x + k * sigma) / true[name]) for k in (-1.96, 0.0, 1.96)]
