@@ -2,10 +2,11 @@
 
     python experiments/bench/independent_figures.py [--tables errors consistency noise] [--seeds 0 1]
         [--beams 32 16] [--motions vehicle handheld] [--starts rest] [--seconds 25] [--imu-rate 200]
-        [--recipes default fast_lio2 lio_sam lidar-only loam] [--systems rko-lio kiss-icp] [--data DIR] [--json]
+        [--recipes default fast_lio2 lio_sam lidar-only loam] [--systems rko-lio kiss-icp] [--data DIR]
+        [--json]
 
-``errors`` compares the trajectories with those of peers (see lio_vs_peers.py), ``consistency`` gives NEES and
-NIS per degree of freedom with shipped settings and the run's verdict (see consistency.py), and ``noise`` tunes
+``errors`` compares the trajectories with those of peers (see lio_vs_peers.py). ``consistency`` gives NEES and
+NIS per degree of freedom with shipped settings, and the run's verdict (see consistency.py). ``noise`` tunes
 without truth from 10 times the true noise. ``lidar-only`` is the recipe default without inertial samples.
 """
 
@@ -29,7 +30,11 @@ sys.path += [str(_EXPERIMENTS), str(_EXPERIMENTS.parent)]
 _LIDAR_ONLY = "lidar-only"
 _WITHOUT_IMU = "config.imu.use=false"
 _FACTOR = 10.0
-_TUNED = {"imu.gyro_noise": "gyro_noise", "imu.accel_noise": "accel_noise", "lidar.range_sigma": "range_sigma"}
+_TUNED = {
+    "imu.gyro_noise": "gyro_noise",
+    "imu.accel_noise": "accel_noise",
+    "lidar.range_sigma": "range_sigma",
+}
 """Parameters that have a true value, and its name in the recording."""
 
 
@@ -119,7 +124,8 @@ def consistency(paths: list[Path], options: argparse.Namespace) -> list[dict[str
     rows = []
     heading = ["NEES rot", "NEES pos", "NEES pose", "NEES vel", "NIS mean", "NIS med"]
     heading += ["ATE mm", "end mm", "sigma mm"]
-    print(f"\n{'recording':38}{'recipe':>11}" + "".join(f"{name:>10}" for name in heading) + "  lost, verdict")
+    columns = "".join(f"{name:>10}" for name in heading)
+    print(f"\n{'recording':38}{'recipe':>11}{columns}  lost, verdict")
     for path in paths:
         for name in options.recipes:
             one = measured(*_recipe(name), _sequence(path))

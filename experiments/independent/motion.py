@@ -1,5 +1,6 @@
 """Motion of the IMU through the street by scipy's splines, which give the exact derivatives."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -52,7 +53,9 @@ class Motion:
         return self.rotation(times).inv().apply(self.position(times, 2) - GRAVITY)
 
 
-def motion_of(kind: Kind, start: Start, seconds: float, seed: int, line: CentreLine, ground: Ground) -> Motion:
+def motion_of(
+    kind: Kind, start: Start, seconds: float, seed: int, line: CentreLine, ground: Ground
+) -> Motion:
     """Return a drive or a walk along the street.
 
     Args:
@@ -65,8 +68,9 @@ def motion_of(kind: Kind, start: Start, seconds: float, seed: int, line: CentreL
     """
     rng = np.random.default_rng([seed, 2])
     knots = np.arange(-4, round(seconds / _KNOT_S) + 5) * _KNOT_S
-    # the motion begins before the recording where that is to begin in motion
-    since = knots - REST_S if start == "rest" else knots + max(lasts for _, lasts, _ in _SPEEDS[kind][:1])
+    first_change_s = _SPEEDS[kind][0][1]
+    # a recording that begins in motion begins when the first speed is reached
+    since = knots - REST_S if start == "rest" else knots + first_change_s
     arc = _FIRST_ARC_M[kind] + _way(kind, since)
     if start == "moving":
         arc -= _way(kind, np.array([since[0]]))
@@ -104,7 +108,7 @@ def _way(kind: Kind, since: Floats) -> Floats:
     return np.interp(since, fine, way)
 
 
-def _waves(rng: np.random.Generator, times: Floats):  # type: ignore[no-untyped-def]
+def _waves(rng: np.random.Generator, times: Floats) -> Callable[[list[float], float, float], Floats]:
     """Return a function that draws sums of three sines for three axes."""
 
     def drawn(amplitude: list[float], lowest_hz: float, highest_hz: float) -> Floats:

@@ -1,7 +1,7 @@
 """Put a world, a motion and sensors together, and write them as a native recording with the truth."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -39,8 +39,8 @@ class Recording:
     seconds: float = 20.0
     motion_kind: Kind = "vehicle"
     start: Start = "rest"
-    lidar: Lidar = Lidar()
-    imu: Imu = Imu()
+    lidar: Lidar = field(default_factory=Lidar)
+    imu: Imu = field(default_factory=Imu)
 
     @cached_property
     def _place(self) -> tuple[CentreLine, Ground]:
@@ -73,8 +73,8 @@ class Recording:
         samples = self.samples
         times = np.arange(round(self.seconds * _TRUTH_HZ) + 1) / _TRUTH_HZ
         known = {
-            **{f"imu_{name}" if name == "rate_hz" else name: value for name, value in asdict(self.imu).items()},
-            **{name: value for name, value in asdict(self.lidar).items()},
+            **asdict(self.imu),
+            **asdict(self.lidar),
             "gyro_bias": samples.gyro_bias,
             "accel_bias": samples.accel_bias,
             "imu_stamp_ns": _stamps(samples.time),
