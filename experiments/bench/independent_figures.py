@@ -101,13 +101,13 @@ def recordings(options: argparse.Namespace, folder: Path) -> Iterator[Path]:
 def errors(path: Path, options: argparse.Namespace) -> dict[str, dict[str, Any]]:
     """Run all systems over one recording and print their times and errors."""
     from isolated import run
-    from lio_makers import our_maker, peer_maker
+    from lio_makers import our_maker, our_name, peer_maker
     from lio_vs_peers import print_table, summary_of
 
     makers = {}
     for name in options.recipes:
         recipe, overrides = _recipe(name)
-        makers[name] = our_maker(recipe, tuple(overrides), 2)
+        makers[our_name(name)] = our_maker(recipe, tuple(overrides), 2)
     makers |= {name: peer_maker(name, 2) for name in options.systems}
     outcomes = run(path, makers, lambda line: print(line, flush=True))
     systems = {name: summary_of(name, outcome, path) for name, outcome in outcomes.items()}

@@ -116,9 +116,10 @@ def _recordings(options: argparse.Namespace) -> "list[Recording]":
 
 
 def _makers(options: argparse.Namespace) -> "dict[str, Maker]":
-    from lio_makers import our_maker, peer_maker
+    from lio_makers import our_maker, our_name, peer_maker
 
-    makers = {recipe: our_maker(recipe, tuple(options.set), options.threads) for recipe in options.recipes}
+    overrides = tuple(options.set)
+    makers = {our_name(recipe): our_maker(recipe, overrides, options.threads) for recipe in options.recipes}
     return makers | {name: peer_maker(name, options.threads) for name in options.systems}
 
 
