@@ -14,7 +14,7 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -65,27 +65,45 @@ def main() -> None:
 def judged(
     recipe: str, overrides: list[str], world: str, sensor: str, seed: int, seconds: float
 ) -> dict[str, float]:
-    """Return the figures of one drive."""
+    """Return the figures of one simulated drive."""
     from lio_jax import ImuModel, SimulatedSequence
-    from lio_jax.evaluation.trajectory_error import align, nees, position_errors
-    from lio_jax.run.run import imu_feed, settings_for
-    from lio_jax.run.track import CompiledStep, run_steps, scan_inputs
-    from lio_jax.settings.settings import recipe_settings, with_overrides
 
     sequence = SimulatedSequence(world, sensor, seconds, seed, imu=ImuModel())
+    return measured(recipe, overrides, sequence).figures
+
+
+class Measured(NamedTuple):
+    """What a run shows beside the truth."""
+
+    figures: dict[str, float]
+    """NEES and NIS per degree of freedom, and errors in mm."""
+    verdict: dict[str, Any]
+    """The run's own judgement, as in metrics.json."""
+    lost_scans: int
+
+
+def measured(recipe: str, overrides: list[str], sequence: Any) -> Measured:
+    """Run a recipe with shipped settings over a recording that holds the truth."""
+    from lio_jax.evaluation.trajectory_error import align, nees, position_errors
+    from lio_jax.run.run import imu_feed, settings_for
+    from lio_jax.run.track import track
+    from lio_jax.run.verdict import Verdict
+    from lio_jax.settings.settings import recipe_settings, with_overrides
+
     settings, _ = settings_for(sequence, with_overrides(recipe_settings(recipe), overrides))
-    motion, truth = sequence.truth(), _Truth()
+    motion, truth, verdict, lost_scans = sequence.truth(), _Truth(), Verdict(settings), 0
     errors, covariances, nis, poses, references = [], [], [], [], []
-    inputs = scan_inputs(settings, sequence.scans(), imu_feed(sequence, settings)[0])
-    for fed, state, output in run_steps(CompiledStep(settings), inputs):
-        at = motion.at(fed.end_ns + np.array([-_MOMENT_NS, 0, _MOMENT_NS]))
+    for result in track(settings, sequence.scans(), imu_feed(sequence, settings)[0]):
+        verdict.take(result)
+        lost_scans += bool(result.output.lost)
+        at = motion.at(result.stamp_ns + np.array([-_MOMENT_NS, 0, _MOMENT_NS]))
         if len(at) < 3:
             continue
         velocity = (at.positions[2] - at.positions[0]) / (2e-9 * _MOMENT_NS)
-        errors.append(truth.error(state.nav, at.poses[1], velocity))
-        covariances.append(np.asarray(output.covariance)[:9, :9])
-        nis.append((float(output.nis), int(output.nis_dof)))
-        poses.append(np.asarray(state.nav.T_world_imu.as_matrix()))
+        errors.append(truth.error(result.nav, at.poses[1], velocity))
+        covariances.append(np.asarray(result.output.covariance)[:9, :9])
+        nis.append((float(result.output.nis), int(result.output.nis_dof)))
+        poses.append(result.T_world_imu)
         references.append(at.poses[1])
     error, covariance = np.array(errors)[_SETTLED:], np.array(covariances)[_SETTLED:]
     estimate, reference = np.array(poses), np.array(references)
@@ -96,13 +114,14 @@ def judged(
         / (part.stop - part.start)
         for name, part in _PARTS.items()
     }
-    return found | {
+    figures = found | {
         "nis_mean": float(squared.sum() / max(freedom.sum(), 1)),
         "nis_median": float(np.median(squared / np.maximum(freedom, 1))),
         "ate_mm": 1e3 * float(np.sqrt(np.mean(off**2))),
         "end_mm": 1e3 * float(np.linalg.norm(error[-1, 3:6])),
         "sigma_mm": 1e3 * float(np.sqrt(np.trace(covariance[-1, 3:6, 3:6]))),
     }
+    return Measured(figures, verdict.verdict(), lost_scans)
 
 
 class _Truth:

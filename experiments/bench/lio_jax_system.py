@@ -108,7 +108,9 @@ def noise_for(recipe: str, sequence: Sequence) -> tuple[str, ...]:
     """Return as overrides the noise of the sensors that a recipe takes from the recording."""
     fitted = with_inertial_noise(sequence, recipe_settings(recipe))[0]
     fitted = with_range_noise(fitted, sequence.scans())[0]
-    inertial = (f"params.imu.{name}={fitted.values['imu'][name]}" for name in ("gyro_noise", "accel_noise"))
+    # loam has no inertial samples
+    densities = ("gyro_noise", "accel_noise") if "imu" in fitted.values else ()
+    inertial = (f"params.imu.{name}={fitted.values['imu'][name]}" for name in densities)
     return (*inertial, f"params.lidar.range_sigma={fitted.values['lidar']['range_sigma']}")
 
 

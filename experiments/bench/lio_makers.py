@@ -20,6 +20,11 @@ def peer_maker(name: str, threads: int) -> Maker:
     return Maker("lio_makers", "peer", (name, threads))
 
 
+def our_name(recipe: str) -> str:
+    """Return the name of one of our recipes in the tables: not that of a peer, whose poses are earlier."""
+    return f"lio_jax-{recipe}" if recipe in PEER_NAMES else recipe
+
+
 def our_maker(recipe: str, overrides: tuple[str, ...], threads: int) -> Maker:
     """Return the maker of one of our recipes."""
     return Maker("lio_makers", "ours", (recipe, overrides, threads))

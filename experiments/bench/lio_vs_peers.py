@@ -65,16 +65,16 @@ def main() -> None:
         for recording in _recordings(options):
             path = written(recording, Path(folder))
             outcomes = run(path, makers, lambda line: print(line, flush=True))
-            systems = {name: _summary(name, outcome, path) for name, outcome in outcomes.items()}
+            systems = {name: summary_of(name, outcome, path) for name, outcome in outcomes.items()}
             _add_ratios(systems)
             load = os.getloadavg()[0]
-            _print_table(f"{recording.name} (load {load:.1f})", systems)
+            print_table(f"{recording.name} (load {load:.1f})", systems)
             report["recordings"][recording.name] = {"load": load, "systems": systems}
             groups.setdefault(recording.group, []).append(systems)
     report["means"] = {group: _means(runs) for group, runs in groups.items()}
     for group, runs in groups.items():
         if len(runs) > 1:
-            _print_table(f"{group}: mean of {len(runs)} seeds", report["means"][group])
+            print_table(f"{group}: mean of {len(runs)} seeds", report["means"][group])
     print()
     for name, (instant, reason) in report["pose_instants"].items():
         print(f"{name}: poses compared {instant:g} of the way through the scan ({reason})")
@@ -116,13 +116,15 @@ def _recordings(options: argparse.Namespace) -> "list[Recording]":
 
 
 def _makers(options: argparse.Namespace) -> "dict[str, Maker]":
-    from lio_makers import our_maker, peer_maker
+    from lio_makers import our_maker, our_name, peer_maker
 
-    makers = {recipe: our_maker(recipe, tuple(options.set), options.threads) for recipe in options.recipes}
+    overrides = tuple(options.set)
+    makers = {our_name(recipe): our_maker(recipe, overrides, options.threads) for recipe in options.recipes}
     return makers | {name: peer_maker(name, options.threads) for name in options.systems}
 
 
-def _summary(name: str, outcome: "Outcome", path: Path) -> dict[str, Any]:
+def summary_of(name: str, outcome: "Outcome", path: Path) -> dict[str, Any]:
+    """Return time, memory and errors of one system on one recording."""
     from lio_jax.core.errors import LioJaxError
 
     summary: dict[str, Any] = {
@@ -204,7 +206,8 @@ def _means(runs: list[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
     return means
 
 
-def _print_table(title: str, systems: dict[str, dict[str, Any]]) -> None:
+def print_table(title: str, systems: dict[str, dict[str, Any]]) -> None:
+    """Print the figures of all systems on one recording, or their means."""
     print(f"\n{title}")
     print("  ".join(["system".ljust(12), *(heading.rjust(9) for heading in _COLUMNS.values())]))
     for name, summary in systems.items():

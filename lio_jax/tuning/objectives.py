@@ -120,26 +120,37 @@ _SHARPNESS = math.sqrt(3.0)
 
 
 class MeanOverScans(eqx.Module):
-    """The mean of a loss of single scans; scans that could not be matched do not count."""
+    """The mean of a loss of single scans. A scan that could not be matched has the loss of the worst one that
+    was: without it, parameters that lose the hardest scans would have the lowest mean.
+
+    The loss of a lost scan is a constant of the derivative. If no scan was matched, the mean is infinite.
+    """
 
     loss: Callable[[Observed, TruePose], Float[Array, ""]]
     """A pure function, or a pytree that can be called."""
     skip: int = eqx.field(static=True, default=0)
     """Scans at the start that do not count."""
 
-    def start(self) -> Float[Array, "3"]:
-        """Return sum, count and scans seen."""
-        return jnp.zeros(3, state_dtype())
+    def start(self) -> Float[Array, "5"]:
+        """Return the sum over matched scans, their number, the scans seen, those lost, and the worst loss."""
+        return jnp.zeros(5, state_dtype()).at[4].set(-jnp.inf)
 
-    def add(self, sums: Float[Array, "3"], seen: Observed, truth: TruePose) -> Float[Array, "3"]:
+    def add(self, sums: Float[Array, "5"], seen: Observed, truth: TruePose) -> Float[Array, "5"]:
         """Add a scan's loss."""
-        counts = ~seen.lost & (sums[2] >= self.skip)
+        begun = sums[2] >= self.skip
+        counts = begun & ~seen.lost
         loss = jnp.where(counts, self.loss(seen, truth), 0.0)
-        return sums + jnp.stack([loss, jnp.where(counts, 1.0, 0.0), jnp.ones_like(loss)])
+        worst = jnp.maximum(sums[4], jnp.where(counts, loss, -jnp.inf))
+        one = jnp.ones_like(loss)
+        numbers = [jnp.where(counts, one, 0.0), one, jnp.where(begun & seen.lost, one, 0.0)]
+        return jnp.concatenate([sums[:4] + jnp.stack([loss, *numbers]), jax.lax.stop_gradient(worst)[None]])
 
-    def value(self, sums: Float[Array, "3"]) -> Float[Array, ""]:
-        """Return the mean."""
-        return sums[0] / jnp.maximum(sums[1], 1.0)
+    def value(self, sums: Float[Array, "5"]) -> Float[Array, ""]:
+        """Return the mean; 0 where no scan counts."""
+        total, matched, _, lost, worst = sums
+        charged = jnp.where(lost > 0, lost * jax.lax.stop_gradient(worst), 0.0)
+        mean = (total + jnp.where(matched > 0, charged, 0.0)) / jnp.maximum(matched + lost, 1.0)
+        return jnp.where((matched > 0) | (lost == 0), mean, jnp.inf)
 
 
 class MarginalLikelihood(eqx.Module):

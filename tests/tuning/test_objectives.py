@@ -106,12 +106,39 @@ def test_poses_without_truth_do_not_count():
     assert float(whole) == pytest.approx(float(AbsoluteError().value(sums)), rel=1e-12)
 
 
-def test_the_mean_leaves_out_lost_scans_and_the_opening():
-    mean = MeanOverScans(lambda seen, truth: seen.nav.T_world_imu.translation()[0], skip=2)
+def mean_of(losses, lost, skip=0, scale=1.0):
+    """Return the mean of made losses; ``lost`` says which scans could not be matched."""
+    mean = MeanOverScans(lambda seen, truth: seen.nav.T_world_imu.translation()[0] * scale, skip)
     sums, truth = mean.start(), TruePose(jaxlie.SE3.identity(), jnp.array(False))
-    for k, lost in enumerate([False, False, False, True, False]):
-        sums = mean.add(sums, seen_at(jnp.array([1.0, 0, 0, 0, k, 0, 0]), lost), truth)
-    assert float(mean.value(sums)) == pytest.approx((2 + 4) / 2)
+    for one, gone in zip(losses, lost, strict=True):
+        sums = mean.add(sums, seen_at(jnp.array([1.0, 0, 0, 0, one, 0, 0]), gone), truth)
+    return mean.value(sums)
+
+
+def test_the_mean_charges_lost_scans_as_the_worst_and_leaves_out_the_opening():
+    found = mean_of(range(6), [True, False, False, False, True, False], skip=2)
+    assert float(found) == pytest.approx((2 + 3 + 5 + 5) / 4)
+
+
+def test_parameters_that_lose_hard_scans_are_worse_than_those_that_match_them():
+    losses = [1.0, 2.0, 9.0, 1.0, 8.5, 8.0]
+    matched = mean_of(losses, [False] * 6)
+    assert mean_of(losses, [False] * 4 + [True, True]) > matched
+    assert mean_of([loss - 10 for loss in losses], [False] * 4 + [True, True]) > matched - 10
+    assert mean_of(losses, [True] * 6) == np.inf
+
+
+def test_a_lost_scan_is_a_constant_of_the_derivative_of_the_mean():
+    losses, lost = [1.0, 2.0, 9.0, 4.0], [False, False, False, True]
+    for derivative in (jax.grad, jax.jacfwd):
+        slope = derivative(lambda scale: mean_of(losses, lost, scale=scale))(1.0)
+        assert float(slope) == pytest.approx((1 + 2 + 9) / 4)
+    none = jax.grad(lambda scale: mean_of(losses, [True] * 4, scale=scale))(1.0)
+    assert float(none) == 0.0
+
+
+def test_the_mean_of_a_recording_shorter_than_the_opening_is_zero():
+    assert float(mean_of([1.0, 2.0], [False, True], skip=2)) == 0.0
 
 
 def test_sums_of_objectives_by_name():
