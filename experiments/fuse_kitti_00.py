@@ -11,7 +11,6 @@ differences vanish are left out, and the odometry bridges the gaps.
     python experiments/fuse_kitti_00.py --data FOLDER_WITH_kiss_icp_kitti_00 [--tune] [--out DIR]
 """
 
-import argparse
 import os
 from pathlib import Path
 

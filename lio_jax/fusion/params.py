@@ -49,6 +49,8 @@ class FixParams(eqx.Module):
     """Factor of all standard deviations."""
     lever_arm: Float[Array, "3"] = leaf((0.0, 0.0, 0.0), "m")
     """Position of the antenna, IMU frame."""
+    time_offset_sigma: Scalar = leaf(0.0, "s", least=0)
+    """Standard deviation of what has to be added to the fixes' stamps; zero: the stamps are right."""
     kernel: Scalar = leaf(5.0, "", above=0)
     """Width of the Geman-McClure kernel of a fix, standard deviations."""
 

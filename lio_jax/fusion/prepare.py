@@ -14,7 +14,7 @@ from lio_jax.core.types import ImuBatch, state_dtype
 from lio_jax.data.sequence import GpsData, ImuData
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.fusion.params import FusionParams
-from lio_jax.fusion.problem import FusedStates, Fixes, Problem, UnitCovariances
+from lio_jax.fusion.problem import Fixes, FusedStates, Problem, UnitCovariances
 from lio_jax.fusion.start import first_guess
 from lio_jax.imu.params import ImuParams
 from lio_jax.imu.preintegration import Preintegrated, preintegrate_parallel
@@ -31,7 +31,7 @@ _LEAST_POSES = 5
 _AT_ONCE = 256
 
 
-def prepare(
+def prepare_fusion(
     odometry: Trajectory, imu: ImuData, gps: GpsData | None, params: FusionParams
 ) -> tuple[Problem, FusedStates]:
     """Return the measurements and a first guess of the unknowns.

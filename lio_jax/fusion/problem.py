@@ -28,7 +28,7 @@ from lio_jax.imu.preintegration import Preintegrated
 
 NODE_DOF = 21
 """Error of a state: that of a motion state (15), then the odometry's white error (rotation, translation)."""
-COMMON_DOF = 17
+COMMON_DOF = 18
 """Error of the common unknowns, in the order of :class:`Common`; the level rotation's is in level axes."""
 STILL_SPEED = 0.1
 """Speed, m/s, whose way counts for the drift of an odometry at rest."""
@@ -101,6 +101,8 @@ class Common(NamedTuple):
     T_level_world: jaxlie.SE3
     time_offset: Array
     """What has to be added to the odometry's stamps, s."""
+    fix_offset: Array
+    """What has to be added to the fixes' stamps, s."""
 
 
 class FusedStates(eqx.Module):
@@ -109,8 +111,8 @@ class FusedStates(eqx.Module):
     motion: Float[Array, "n 22"]
     """Quaternion w x y z and position of the IMU in world, velocity, gyroscope's and accelerometer's bias, and
     the odometry's white error: rotation (rad) and translation (m), sensor frame."""
-    common: Float[Array, "19"]
-    """T_imu_sensor (7), logarithm of the scale, turn per way (3), T_level_world (7), clock offset."""
+    common: Float[Array, "20"]
+    """T_imu_sensor (7), logarithm of the scale, turn per way (3), T_level_world (7), clock offsets of the odometry and of the fixes."""
 
     def motion_states(self) -> MotionState:
         """Return pose, velocity and biases of each state."""
@@ -120,7 +122,7 @@ class FusedStates(eqx.Module):
         """Return the common unknowns."""
         return common_of(self.common)
 
-    def retract(self, nodes: Float[Array, "n 21"], common: Float[Array, "17"]) -> "FusedStates":
+    def retract(self, nodes: Float[Array, "n 21"], common: Float[Array, "18"]) -> "FusedStates":
         """Return the unknowns with errors applied."""
         return FusedStates(retract_node(self.motion, nodes), retract_common(self.common, common))
 
@@ -130,10 +132,10 @@ def motion_of(node: Float[Array, "*b 22"]) -> MotionState:
     return MotionState(jaxlie.SE3(node[..., :7]), node[..., 7:10], node[..., 10:13], node[..., 13:16])
 
 
-def common_of(packed: Float[Array, "19"]) -> Common:
+def common_of(packed: Float[Array, "20"]) -> Common:
     """Return the packed common unknowns by name."""
     return Common(
-        jaxlie.SE3(packed[:7]), packed[7], packed[8:11], jaxlie.SE3(packed[11:18]), packed[18]
+        jaxlie.SE3(packed[:7]), packed[7], packed[8:11], jaxlie.SE3(packed[11:18]), packed[18], packed[19]
     )
 
 
@@ -144,7 +146,7 @@ def retract_node(node: Float[Array, "*b 22"], error: Float[Array, "*b 21"]) -> F
     return jnp.concatenate([*parts, node[..., 16:] + error[..., 15:]], axis=-1)
 
 
-def retract_common(packed: Float[Array, "19"], error: Float[Array, "17"]) -> Float[Array, "19"]:
+def retract_common(packed: Float[Array, "20"], error: Float[Array, "18"]) -> Float[Array, "20"]:
     """Return the packed common unknowns with their error applied."""
     mounting = (jaxlie.SO3(packed[:4]) @ jaxlie.SO3.exp(error[:3])).normalize().wxyz
     level = (jaxlie.SO3.exp(error[10:13]) @ jaxlie.SO3(packed[11:15])).normalize().wxyz
@@ -153,7 +155,7 @@ def retract_common(packed: Float[Array, "19"], error: Float[Array, "17"]) -> Flo
             mounting,
             packed[4:11] + error[3:10],
             level,
-            packed[15:19] + error[13:17],
+            packed[15:20] + error[13:18],
         ]
     )
 
@@ -187,7 +189,7 @@ class Roots(eqx.Module):
     white: Float[Array, "6"]
     """Of the odometry's white error."""
     first: Float[Array, "15"]
-    common: Float[Array, "17"]
+    common: Float[Array, "18"]
     fix: Float[Array, "g 3"]
 
     def log_determinant(self) -> Array:
@@ -238,19 +240,20 @@ def roots_of(problem: Problem, params: FusionParams) -> Roots:
             jnp.asarray((_WIDE_TURN, _WIDE_TURN, yaw), dtype),
             jnp.full(3, origin, dtype),
             noise.time_offset_sigma,
+            params.gps.time_offset_sigma,
         ),
         fix=1 / (params.gps.sigma_scale * problem.fixes.sigma),
     )
 
 
-def gravity_in_world(packed: Float[Array, "19"], gravity: Float[Array, ""]) -> Float[Array, "3"]:
+def gravity_in_world(packed: Float[Array, "20"], gravity: Float[Array, ""]) -> Float[Array, "3"]:
     """Return the acceleration of gravity in the odometry's world, m/s^2."""
     level = common_of(packed).T_level_world.rotation()
     return level.inverse() @ (-gravity * jnp.eye(3, dtype=packed.dtype)[2])
 
 
 def gravity_by_level(
-    end: Float[Array, "22"], packed: Float[Array, "19"], duration: Float[Array, ""], gravity: Array
+    end: Float[Array, "22"], packed: Float[Array, "20"], duration: Float[Array, ""], gravity: Array
 ) -> Float[Array, "15 3"]:
     """Return the derivative of an inertial residual by the rotation of T_level_world, level axes."""
     level = rotation_matrix(common_of(packed).T_level_world.rotation())
@@ -286,7 +289,7 @@ def first_residual(node: Array, packed: Array, problem: Problem) -> Float[Array,
     return jnp.concatenate([pose, state.velocity, state.gyro_bias, state.accel_bias])
 
 
-def common_residual(packed: Array, problem: Problem) -> Float[Array, "17"]:
+def common_residual(packed: Array, problem: Problem) -> Float[Array, "18"]:
     """Return the common unknowns' difference from their prior, not whitened."""
     common, guess = common_of(packed), jaxlie.SE3(problem.level)
     mounting = jaxlie.SE3(problem.mounting)
@@ -301,13 +304,12 @@ def common_residual(packed: Array, problem: Problem) -> Float[Array, "17"]:
             level,
             common.T_level_world.translation() - guess.translation(),
             common.time_offset[None],
+            common.fix_offset[None],
         ]
     )
 
 
-def fix_residual(
-    start: Array, end: Array, packed: Array, row: tuple, lever_arm: Array
-) -> Float[Array, "3"]:
+def fix_residual(start: Array, end: Array, packed: Array, row: tuple, lever_arm: Array) -> Float[Array, "3"]:
     """Return the antenna's position in the level frame minus a fix, m.
 
     Between two states the position is the cubic through both positions and velocities.
@@ -323,7 +325,7 @@ def fix_residual(
         second.velocity,
     )
     centre = sum((weight * knot for weight, knot in zip(weights, knots, strict=True)), jnp.zeros(3))
+    centre = centre + common.fix_offset * ((1 - u) * first.velocity + u * second.velocity)
     turn = (first.T_world_imu.rotation().inverse() @ second.T_world_imu.rotation()).log()
     rotation = first.T_world_imu.rotation() @ jaxlie.SO3.exp(u * turn)
     return common.T_level_world @ (centre + rotation @ lever_arm) - position
-

@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.geometry import adjoint_of
+from lio_jax.core.leaf import traced
 from lio_jax.core.types import CONVERGED, NOT_FINITE
 from lio_jax.data.sequence import GpsData, ImuData
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.fusion.params import FusionParams
-from lio_jax.fusion.prepare import prepare, within
+from lio_jax.fusion.prepare import prepare_fusion, within
 from lio_jax.fusion.problem import FusedStates, Problem
 from lio_jax.fusion.solve import Fused, fuse
 
@@ -45,6 +46,8 @@ class FusedRecording:
     """Length by the odometry over the true length."""
     time_offset: float
     """What has to be added to the odometry's stamps, s."""
+    fix_offset: float
+    """What has to be added to the fixes' stamps, s."""
     fused: Fused
     """The result in arrays."""
     problem: Problem
@@ -70,10 +73,8 @@ def fuse_recording(
     Raises:
         LioJaxError: times do not overlap, or the numbers have no finite solution.
     """
-    from lio_jax.core.leaf import traced
-
     params = traced(FusionParams) if params is None else params
-    problem, states = prepare(odometry, imu, gps, params)
+    problem, states = prepare_fusion(odometry, imu, gps, params)
     return solved(within(odometry, imu), problem, states, params)
 
 
@@ -118,6 +119,7 @@ def solved(
         T_level_world=level,
         scale=float(jnp.exp(common.log_scale)),
         time_offset=float(common.time_offset),
+        fix_offset=float(common.fix_offset),
         fused=fused,
         problem=problem,
     )

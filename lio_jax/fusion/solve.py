@@ -53,7 +53,7 @@ class FusionNormal(eqx.Module):
     """Gauss-Newton's Hessian."""
     nodes: Float[Array, "n 21"]
     """Gradient by the states' errors."""
-    common: Float[Array, "17"]
+    common: Float[Array, "18"]
     """Gradient by the common unknowns' errors."""
     cost: Float[Array, ""]
     """Negative log-density of unknowns and measurements, without a constant."""
@@ -75,7 +75,7 @@ class Fused(eqx.Module):
     by the parameters."""
     covariance: Float[Array, "n 21 21"]
     """Marginal covariance of each state's error."""
-    common_covariance: Float[Array, "17 17"]
+    common_covariance: Float[Array, "18 18"]
     """Covariance of the common unknowns' error."""
 
 
@@ -159,7 +159,7 @@ def linearise_fusion(
                 jnp.pad(by[:, :15], ((0, 0), (0, 6))),
                 jnp.pad(by[:, 15:], ((0, 0), (0, 16))),
                 jnp.where(imu.measured, level, 0.0),
-                jnp.zeros((15, 4), dtype),
+                jnp.zeros((15, 5), dtype),
             ],
             axis=1,
         )
@@ -167,9 +167,7 @@ def linearise_fusion(
 
     imu_by, imu = jax.vmap(inertial)(a, b, problem.imu)
     odometry_by, odometry = jax.vmap(lambda a, b, row: pair(odometry_residual, a, b, row))(a, b, row)
-    fix_by, fixes = jax.vmap(
-        lambda c, d, fix: pair(lambda *x: fix_residual(*x, arm), c, d, fix)
-    )(c, d, fix)
+    fix_by, fixes = jax.vmap(lambda c, d, fix: pair(lambda *x: fix_residual(*x, arm), c, d, fix))(c, d, fix)
     link_by = jnp.concatenate([imu_by, odometry_by], axis=1)
     link = jnp.concatenate([imu, odometry], axis=1)
 
@@ -316,9 +314,9 @@ def fuse(
     does not lose them. Turn on double precision: float32 does not hold the information of inertial samples.
 
     Args:
-        problem: the measurements, from :func:`prepare`.
+        problem: the measurements, from :func:`prepare_fusion`.
         params: noise, priors and calibration.
-        states: first guess, from :func:`prepare`.
+        states: first guess, from :func:`prepare_fusion`.
         iterations: largest number of linearisations of each of both searches.
         exact: as for :func:`negative_log_likelihood`.
     """

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from lio_jax.core.types import state_dtype
 from lio_jax.fusion.params import FusionParams
-from lio_jax.fusion.problem import FusedStates, Fixes, Problem, UnitCovariances
+from lio_jax.fusion.problem import Fixes, FusedStates, Problem, UnitCovariances
 from lio_jax.imu.preintegration import Preintegrated
 
 _Array = NDArray[np.float64]
@@ -70,7 +70,7 @@ def first_guess(
     )
     nothing = np.zeros((len(time), 12))
     motion = np.concatenate([_packed(imu), velocity, nothing], axis=1)
-    common = np.concatenate([_packed(mounting[None])[0], np.zeros(4), _packed(level[None])[0], np.zeros(1)])
+    common = np.concatenate([_packed(mounting[None])[0], np.zeros(4), _packed(level[None])[0], np.zeros(2)])
     return problem, FusedStates(jnp.asarray(motion, dtype), jnp.asarray(common, dtype))
 
 
