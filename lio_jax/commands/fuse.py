@@ -231,7 +231,8 @@ def _show(
 ) -> None:
     links = int(jnp.sum(~fused.problem.imu.measured))
     print(
-        f"poses       {len(fused.sensor)}, {len(fused.problem.fixes.link)} fixes, {links} links without samples"
+        f"poses       {len(fused.sensor)}, {len(fused.problem.fixes.link)} fixes, "
+        f"{links} links without samples"
     )
     print(
         f"gravity     {json.dumps([round(value, 4) for value in fused.gravity.tolist()])} m/s^2 in the world"

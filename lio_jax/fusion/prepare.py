@@ -1,11 +1,10 @@
-"""From recorded poses, samples and fixes to the measurements of a fusion and a first guess of its unknowns."""
+"""Prepare recorded poses, samples and fixes as the measurements of a fusion, with a first guess."""
 
 from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,7 +35,7 @@ def prepare_fusion(
 ) -> tuple[Problem, FusedStates]:
     """Return the measurements and a first guess of the unknowns.
 
-    Poses before the first and after the last sample are left out, and so are fixes outside of the poses' span.
+    Poses outside of the samples' span are left out, and so are fixes outside of the poses' span.
 
     Args:
         odometry: poses of the odometry's sensor in its world.
@@ -172,8 +171,3 @@ def _fixes(gps: GpsData | None, odometry: Trajectory, params: FusionParams) -> F
         jnp.asarray(gps.position, dtype),
         jnp.asarray(sigma, dtype),
     )
-
-
-def packed_pose(pose: _Array) -> _Array:
-    """Return a (4, 4) pose as quaternion w x y z and position."""
-    return np.asarray(jaxlie.SE3.from_matrix(jnp.asarray(pose)).wxyz_xyz, np.float64)

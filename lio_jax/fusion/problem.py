@@ -109,10 +109,11 @@ class FusedStates(eqx.Module):
     """Unknowns of a fusion, packed: loops over few arrays are fast."""
 
     motion: Float[Array, "n 22"]
-    """Quaternion w x y z and position of the IMU in world, velocity, gyroscope's and accelerometer's bias, and
-    the odometry's white error: rotation (rad) and translation (m), sensor frame."""
+    """Quaternion w x y z and position of the IMU in world, velocity, biases of gyroscope and accelerometer,
+    and the odometry's white error: rotation (rad) and translation (m), sensor frame."""
     common: Float[Array, "20"]
-    """T_imu_sensor (7), logarithm of the scale, turn per way (3), T_level_world (7), clock offsets of the odometry and of the fixes."""
+    """T_imu_sensor (7), logarithm of the scale, turn per way (3), T_level_world (7), and the clock offsets of
+    the odometry and of the fixes."""
 
     def motion_states(self) -> MotionState:
         """Return pose, velocity and biases of each state."""

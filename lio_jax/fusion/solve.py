@@ -42,7 +42,7 @@ from lio_jax.fusion.problem import (
 from lio_jax.imu.preintegration import Preintegrated
 
 _FIRST_DAMPING, _MOST_DAMPING, _WORTH = 1e-6, 1e8, 10.0
-_PRECISION = 1e-3
+_PRECISION = 1e-2
 """Length of the next step, standard deviations of all unknowns together, below which the search ends."""
 
 
@@ -79,7 +79,9 @@ class Fused(eqx.Module):
     """Covariance of the common unknowns' error."""
 
 
-class _Residuals(NamedTuple):
+class Residuals(NamedTuple):
+    """Whitened residuals."""
+
     link: Array
     white: Array
     first: Array
@@ -96,7 +98,10 @@ def _rows(problem: Problem, states: FusedStates) -> tuple[tuple, tuple]:
     return link, fix
 
 
-def _whitened(problem: Problem, params: FusionParams, roots: Roots, states: FusedStates) -> _Residuals:
+def whitened_residuals(
+    problem: Problem, params: FusionParams, roots: Roots, states: FusedStates
+) -> Residuals:
+    """Return all residuals, whitened by ``roots``; half their sum of squares is the cost without kernel."""
     (a, b, row), (c, d, fix) = _rows(problem, states)
     packed, gravity, arm = states.common, params.imu.gravity, params.gps.lever_arm
     down = gravity_in_world(packed, gravity)
@@ -106,7 +111,7 @@ def _whitened(problem: Problem, params: FusionParams, roots: Roots, states: Fuse
     odometry = jax.vmap(lambda a, b, row: odometry_residual(a, b, packed, row))(a, b, row)
     link = jnp.concatenate([imu, odometry], axis=1)
     fixes = jax.vmap(lambda c, d, fix: fix_residual(c, d, packed, fix, arm))(c, d, fix)
-    return _Residuals(
+    return Residuals(
         jnp.einsum("mij,mj->mi", roots.link, link),
         roots.white * states.motion[:, 16:],
         roots.first * first_residual(states.motion[0], packed, problem),
@@ -115,7 +120,7 @@ def _whitened(problem: Problem, params: FusionParams, roots: Roots, states: Fuse
     )
 
 
-def _cost(residuals: _Residuals, kernel: Array) -> Array:
+def _cost(residuals: Residuals, kernel: Array) -> Array:
     square = jnp.sum(residuals.fix**2, axis=1)
     plain = sum((jnp.sum(part**2) for part in residuals[:4]), jnp.zeros_like(kernel))
     return (plain + jnp.sum(square / (1 + square / kernel**2))) / 2
@@ -184,7 +189,7 @@ def linearise_fusion(
     prior = common_residual(states.common, problem) * roots.common
     link_by, link = roots.link @ link_by, jnp.einsum("mij,mj->mi", roots.link, link)
     fix_by, fixes = roots.fix[:, :, None] * fix_by, roots.fix * fixes
-    cost = _cost(_Residuals(link, roots.white * states.motion[:, 16:], first, prior, fixes), kernel)
+    cost = _cost(Residuals(link, roots.white * states.motion[:, 16:], first, prior, fixes), kernel)
     square = jnp.sum(fixes**2, axis=1, keepdims=True)
     weight = jax.lax.stop_gradient(1 / (1 + square / kernel**2))
     fix_by, fixes = fix_by * weight[:, :, None], fixes * weight
@@ -249,7 +254,7 @@ def search(
         factor = factorise_bordered(_damped(normal.matrix, search.damping))
         nodes, common = solve_bordered(factor, -normal.nodes, -normal.common)
         trial = search.states.retract(nodes, common)
-        cost = _cost(_whitened(problem, params, roots, trial), kernel)
+        cost = _cost(whitened_residuals(problem, params, roots, trial), kernel)
         decrement = -jnp.sum(nodes * normal.nodes) - jnp.sum(common * normal.common)
         better = cost <= normal.cost
         near = jnp.abs(decrement) < _PRECISION**2
@@ -299,7 +304,10 @@ def negative_log_likelihood(
         pull = [jax.lax.stop_gradient(part) - part for part in (normal.nodes, normal.common)]
         nodes, common = solve_bordered(factor, *pull)
         held = held.retract(nodes, common)
-    normal = linearise_fusion(problem, params, roots, held, kernel)
+    return _laplace(linearise_fusion(problem, params, roots, held, kernel), roots)
+
+
+def _laplace(normal: FusionNormal, roots: Roots) -> Array:
     return normal.cost + log_determinant_bordered(normal.matrix) / 2 - roots.log_determinant()
 
 
@@ -334,7 +342,10 @@ def fuse(
     zero = jnp.zeros((), jnp.int32)
     begin = (jax.lax.stop_gradient(states), zero, zero, jnp.zeros_like(held.gps.kernel))
     (found, status, count, cost), _ = jax.lax.scan(again, begin, jnp.stack(kernels))
-    normal = linearise_fusion(problem, held, roots_of(problem, held), found, kernels[-1])
-    inverse = inverse_bordered(factorise_bordered(normal.matrix))
-    value = negative_log_likelihood(problem, params, found, kernels[-1], exact)
+    roots = roots_of(problem, params)
+    normal = linearise_fusion(problem, params, roots, found, kernels[-1])
+    value = _laplace(normal, roots)
+    if exact:
+        value = negative_log_likelihood(problem, params, found, kernels[-1])
+    inverse = inverse_bordered(factorise_bordered(jax.lax.stop_gradient(normal.matrix)))
     return Fused(found, status, count, cost, value, inverse.chain.diagonal, inverse.corner)

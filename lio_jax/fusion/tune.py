@@ -33,7 +33,7 @@ _PRIOR = math.log(100.0)
 show keeps its value."""
 _FARTHEST = math.log(1e4)
 """Largest change of a logarithm."""
-_LONGEST = 2.0
+_LONGEST = 4.0
 """Largest change of a logarithm in one step."""
 
 

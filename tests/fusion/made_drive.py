@@ -1,12 +1,17 @@
-"""A made drive whose truth is known: smooth motion, samples with noise and biases, an odometry that drifts."""
+"""A made drive whose truth is known: smooth motion, noisy samples, and an odometry that drifts."""
 
+from itertools import pairwise
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lio_jax.core.leaf import traced
 from lio_jax.data.sequence import GpsData, ImuData
 from lio_jax.data.trajectory import Trajectory
+from lio_jax.fusion.params import FusionParams
+from lio_jax.fusion.tune import replaced
 
 GRAVITY = 9.80665
 GYRO_NOISE, ACCEL_NOISE = 2e-3, 2e-2
@@ -60,7 +65,9 @@ def made_drive(seed=0, seconds=20.0, rate=100, stride=10, noise=1.0, gap=None):
     rates = (before[1].inv() * after[1]).as_rotvec() / (2 * step)
     forces = rotation.inv().apply((after[0] - 2 * position + before[0]) / step**2 + [0, 0, GRAVITY])
     gyro_bias, accel_bias = rng.normal(size=3) * 5e-3, rng.normal(size=3) * 0.05
-    walks = [np.cumsum(rng.normal(size=(len(t), 3)), 0) * walk / np.sqrt(rate) for walk in (GYRO_WALK, ACCEL_WALK)]
+    walks = [
+        np.cumsum(rng.normal(size=(len(t), 3)), 0) * walk / np.sqrt(rate) for walk in (GYRO_WALK, ACCEL_WALK)
+    ]
     gyro = rates + gyro_bias + walks[0] + rng.normal(size=(len(t), 3)) * GYRO_NOISE * np.sqrt(rate)
     accel = forces + accel_bias + walks[1] + rng.normal(size=(len(t), 3)) * ACCEL_NOISE * np.sqrt(rate)
     stamps = np.round(t * 1e9).astype(np.int64) + 1_000_000_000
@@ -68,7 +75,7 @@ def made_drive(seed=0, seconds=20.0, rate=100, stride=10, noise=1.0, gap=None):
     body[:, :3, :3], body[:, :3, 3] = rotation.as_matrix(), position
     sensor = (body @ T_IMU_SENSOR)[::stride]
     drifting = [np.eye(4)]
-    for first, second in zip(sensor[:-1], sensor[1:], strict=True):
+    for first, second in pairwise(sensor):
         relative = np.linalg.inv(first) @ second
         way = np.sqrt(np.linalg.norm(relative[:3, 3]) + 0.1 * stride / rate)
         drifting.append(drifting[-1] @ relative @ _error(rng, noise * way, ROTATION_DRIFT, TRANSLATION_DRIFT))
@@ -92,3 +99,20 @@ def _error(rng, scale, rotation, translation):
     pose[:3, :3] = Rotation.from_rotvec(rng.normal(size=3) * scale * rotation).as_matrix()
     pose[:3, 3] = rng.normal(size=3) * scale * translation
     return pose
+
+
+def true_params(noise=1.0):
+    """Return the parameters of a made drive."""
+    names = {
+        "imu.gyro_noise": GYRO_NOISE,
+        "imu.accel_noise": ACCEL_NOISE,
+        "imu.gyro_bias_walk": GYRO_WALK,
+        "imu.accel_bias_walk": ACCEL_WALK,
+        "odometry.rotation_drift": noise * ROTATION_DRIFT,
+        "odometry.translation_drift": noise * TRANSLATION_DRIFT,
+        "odometry.rotation_noise": noise * ROTATION_NOISE,
+        "odometry.translation_noise": noise * TRANSLATION_NOISE,
+        "initial.accel_bias_sigma": 0.05,
+        "initial.gyro_bias_sigma": 5e-3,
+    }
+    return replaced(traced(FusionParams), list(names), jnp.asarray(list(names.values())))
