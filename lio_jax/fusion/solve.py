@@ -261,12 +261,13 @@ def search(
         taken = better | (near & jnp.isfinite(cost))
         kept = jax.tree.map(lambda new, old: jnp.where(taken, new, old), trial, search.states)
         damping = jnp.where(better, search.damping / _WORTH, search.damping * _WORTH)
-        status = jnp.where(near, CONVERGED, jnp.where(damping > _MOST_DAMPING, NOT_FINITE, ITERATION_LIMIT))
+        status = jnp.where(near, CONVERGED, ITERATION_LIMIT)
         status = jnp.where(jnp.isfinite(normal.cost), status, NOT_FINITE).astype(jnp.int32)
         return _Search(kept, damping, jnp.where(taken, cost, normal.cost), search.iterations + 1, status)
 
     def going(search: _Search) -> Array:
-        return (search.status == ITERATION_LIMIT) & (search.iterations < most)
+        more = (search.iterations < most) & (search.damping <= _MOST_DAMPING)
+        return (search.status == ITERATION_LIMIT) & more
 
     zero, dtype = jnp.zeros((), jnp.int32), states.common.dtype
     begin = _Search(
