@@ -96,7 +96,7 @@ def _numbers(assignments: tuple[str, ...]) -> dict[str, dict[str, Any]]:
             read = [float(one) for one in value] if isinstance(default, tuple) else float(value)
         except (TypeError, ValueError):
             raise UsageError(f"--set {path}={text}: is not a number, or a list of numbers.") from None
-        if isinstance(default, tuple) and len(read) != len(default):
+        if isinstance(read, list) and len(read) != len(default):
             raise UsageError(f"--set {path}={text}: must be a list of {len(default)} numbers.")
         single = read if isinstance(read, list) else [read]
         problems = [declared.problem(read)] if declared.tuned == "turn" else map(declared.problem, single)

@@ -48,7 +48,7 @@ def prepare_fusion(
     """
     odometry = within(odometry, imu)
     time, origin = _seconds(odometry.stamp_ns)
-    samples = (imu.stamp_ns - origin) * 1e-9
+    samples = np.asarray((imu.stamp_ns - origin) * 1e-9, np.float64)
     index, mask = _rows(time, samples)
     batch = _batches(time, samples, imu, index, mask)
     biases = jnp.zeros((2, 3), state_dtype())
@@ -104,8 +104,10 @@ def _batches(
 ) -> ImuBatch:
     dtype = state_dtype()
     relative = samples[index] - time[:-1, None]
-    arrays = (jnp.asarray(rows, dtype) for rows in (relative, imu.gyro[index], imu.accel[index]))
-    return ImuBatch(*arrays, jnp.asarray(mask))
+    seconds, gyro, accel = (
+        jnp.asarray(rows, dtype) for rows in (relative, imu.gyro[index], imu.accel[index])
+    )
+    return ImuBatch(seconds, gyro, accel, jnp.asarray(mask))
 
 
 @jax.jit

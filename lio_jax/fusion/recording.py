@@ -105,7 +105,7 @@ def solved(
     level = np.asarray(common.T_level_world.as_matrix(), np.float64)
     imu = Trajectory(odometry.stamp_ns, poses)
     gravity = level[:3, :3].T @ np.array([0.0, 0.0, -float(params.imu.gravity)])
-    by = adjoint_of(np.linalg.inv(mounting))
+    by = adjoint_of(np.asarray(np.linalg.inv(mounting), np.float64))
     covariance = by @ np.asarray(fused.covariance)[:, :6, :6] @ by.T
     return FusedRecording(
         sensor=imu.times_body(mounting),

@@ -172,7 +172,11 @@ def linearise_fusion(
 
     imu_by, imu = jax.vmap(inertial)(a, b, problem.imu)
     odometry_by, odometry = jax.vmap(lambda a, b, row: pair(odometry_residual, a, b, row))(a, b, row)
-    fix_by, fixes = jax.vmap(lambda c, d, fix: pair(lambda *x: fix_residual(*x, arm), c, d, fix))(c, d, fix)
+    fix_by, fixes = jax.vmap(
+        lambda c, d, fix: pair(
+            lambda first, second, shared, row: fix_residual(first, second, shared, row, arm), c, d, fix
+        )
+    )(c, d, fix)
     link_by = jnp.concatenate([imu_by, odometry_by], axis=1)
     link = jnp.concatenate([imu, odometry], axis=1)
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -56,7 +57,7 @@ def read(params: FusionParams, names: Sequence[str]) -> NDArray[np.float64]:
 def replaced(params: FusionParams, names: Sequence[str], values: jax.Array) -> FusionParams:
     """Return parameters with the values at the paths replaced, which may be traced."""
     for name, value in zip(names, values, strict=True):
-        params = eqx.tree_at(lambda tree, name=name: _at(tree, name), params, value)
+        params = eqx.tree_at(partial(_at, name=name), params, value)
     return params
 
 
@@ -108,8 +109,8 @@ def tune(
         nonlocal best
         trial = replaced(params, names, jnp.exp(jnp.asarray(logs, states.common.dtype)))
         found, status, _, _ = search(problem, trial, best[2], kernel, most)
-        value, gradient = score(problem, jnp.asarray(logs, states.common.dtype), found)
-        value, gradient = float(value), np.asarray(gradient, np.float64)
+        scored = score(problem, jnp.asarray(logs, states.common.dtype), found)
+        value, gradient = float(scored[0]), np.asarray(scored[1], np.float64)
         good = math.isfinite(value) and bool(np.isfinite(gradient).all()) and int(status) == CONVERGED
         away = (logs - start) / _PRIOR
         history.append(
