@@ -22,6 +22,10 @@ from .estimation.smoother import smooth as smooth
 from .evaluation.evaluate import evaluate as evaluate
 from .evaluation.trajectory_error import average_band as average_band
 from .evaluation.trajectory_error import nees as nees
+from .fusion.params import FusionParams as FusionParams
+from .fusion.prepare import prepare_fusion as prepare_fusion
+from .fusion.recording import fuse_recording as fuse_recording
+from .fusion.solve import fuse as fuse
 from .imu.path import deskew_along as deskew_along
 from .imu.preintegration import predict as predict
 from .imu.preintegration import preintegrate as preintegrate

@@ -362,6 +362,35 @@ def optimize_graph(
     command(graph, out, robust, json)
 
 
+@app.command(name="fuse")
+def fuse(
+    odometry: Positional[Annotated[Path, arg(metavar="ODOMETRY")]],
+    imu: Annotated[Path, arg(metavar="FILE")],
+    out: Annotated[Path, arg(metavar="DIR")],
+    gps: Annotated[Path | None, arg(metavar="FILE")] = None,
+    truth: Annotated[Path | None, arg(metavar="FILE")] = None,
+    tune: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    set_: Assignments = (),
+    overwrite: Overwrite = False,
+) -> None:
+    """Fuse the poses of any odometry with inertial samples and GPS fixes, over the whole recording.
+
+    Args:
+        odometry: Poses of the odometry's sensor: TUM file or run folder.
+        imu: Inertial samples: table (CSV), recording, or native imu.npz; in the odometry's clock.
+        out: Folder for the results. trajectory.tum has the frames of the odometry: its sensor in its world.
+        gps: Fixes: table of time and local metres or degrees, or a recording.
+        truth: True poses of the odometry's sensor, to compare with.
+        tune: Find the noise of odometry, samples and fixes by the likelihood of the recording.
+        overwrite: Replace the results of an earlier run in that folder.
+    """
+    from lio_jax.commands.fuse import fuse as command
+    from lio_jax.commands.runtime import prepare_jax
+
+    prepare_jax()
+    command(odometry, imu, gps, truth, tune, set_, out, overwrite)
+
+
 @app.command(name="calibrate-imu")
 def calibrate_imu(
     data: Positional[Annotated[Path, arg(metavar="STATIC_DATA")]],

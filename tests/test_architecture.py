@@ -28,6 +28,7 @@ FLOORS = {
     "data": 4,
     "sim": 4,
     "settings": 5,
+    "fusion": 5,
     "run": 6,
     "evaluation": 7,
     "tuning": 7,
@@ -153,7 +154,7 @@ def test_what_the_package_imports_is_installed_with_it():
 
 
 MODULES = {module_name(path): path for path in FILES}
-MOST_MODULES = 275
+MOST_MODULES = 286
 """Limit of the number of files: a new one earns its place, or another one goes."""
 
 

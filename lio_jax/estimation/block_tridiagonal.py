@@ -49,23 +49,24 @@ def factorise(matrix: BlockTridiagonal) -> Factored:
 
 
 @jax.jit
-def solve(factor: Factored, right: Float[Array, "n d"]) -> Float[Array, "n d"]:
-    """Return the inverse of the matrix times ``right``."""
+def solve(factor: Factored, right: Float[Array, "n d *c"]) -> Float[Array, "n d *c"]:
+    """Return the inverse of the matrix times ``right``, which has one column or c columns."""
+    columns = right.reshape(*right.shape[:2], -1)
 
     def forward(carried: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         lower, scaled, right = row
-        found = _solve_lower(lower, (right - carried)[:, None])[:, 0]
+        found = _solve_lower(lower, right - carried)
         return scaled.T @ found, found
 
     def backward(later: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         lower, scaled, found = row
-        solved = _solve_lower(lower, (found - scaled @ later)[:, None], transposed=True)[:, 0]
+        solved = _solve_lower(lower, found - scaled @ later, transposed=True)
         return solved, solved
 
-    nothing = jnp.zeros_like(right[0])
+    nothing = jnp.zeros_like(columns[0])
     rows = (factor.diagonal, factor.coupling)
-    found = jax.lax.scan(forward, nothing, (*rows, right))[1]
-    return jax.lax.scan(backward, nothing, (*rows, found), reverse=True)[1]
+    found = jax.lax.scan(forward, nothing, (*rows, columns))[1]
+    return jax.lax.scan(backward, nothing, (*rows, found), reverse=True)[1].reshape(right.shape)
 
 
 @jax.jit
