@@ -220,6 +220,8 @@ def _of_few(problem: _Problem, state: _State) -> _State:
     the trusted edges that are less certain than they state. Fewer than five loops do not tell that.
     """
     loops = np.flatnonzero(problem.doubted)
+    if not len(loops):
+        return state
     judged, innovations = problem, _innovations(problem, state, loops).squared
     scale = np.quantile(innovations, _SURELY_RIGHT / 2, method="lower") / chi2.median(problem.size)
     if len(loops) >= _ENOUGH_FOR_SCALE and 1.0 < scale < np.inf:

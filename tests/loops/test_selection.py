@@ -117,6 +117,14 @@ def test_a_few_loops_do_not_bend_the_odometry(right, wrong, sure):
         assert np.all(weights[len(clean.i) :] == 0)
 
 
+def test_a_graph_without_loops_has_nothing_to_select():
+    rng = np.random.default_rng(4)
+    graph = graph_of(walk(jaxlie.SE2, 10, rng), [], rng)
+    found = solve(graph, robust=Robust())
+    assert found.status == "converged"
+    assert np.all(np.asarray(found.weights) == 1)
+
+
 @pytest.mark.parametrize("group", [jaxlie.SE3, jaxlie.SE2], ids=["space", "plane"])
 def test_the_fall_without_a_loop_is_that_of_a_new_solve(group):
     rng = np.random.default_rng(1)
