@@ -197,8 +197,8 @@ def _write(
 
     write_text(out / "trajectory.tum", tum_lines(fused.sensor))
     write_text(out / "trajectory_imu.tum", tum_lines(fused.imu))
+    level = Trajectory(fused.sensor.stamp_ns, fused.T_level_world @ fused.sensor.poses)
     if fixed:
-        level = Trajectory(fused.sensor.stamp_ns, fused.T_level_world @ fused.sensor.poses)
         write_text(out / "trajectory_gps.tum", tum_lines(level))
     with atomic_path(out / "states.npz") as aside:
         np.savez(
@@ -214,8 +214,7 @@ def _write(
             T_imu_sensor=fused.T_imu_sensor,
         )
     write_text(out / "config.yaml", yaml.safe_dump({"params": numbers}, sort_keys=False))
-    level_poses = Trajectory(fused.sensor.stamp_ns, fused.T_level_world @ fused.sensor.poses)
-    plot_trajectory(out / "trajectory.png", level_poses, truth, "fused trajectory")
+    plot_trajectory(out / "trajectory.png", level, truth, "fused trajectory")
     write_json(out / "metrics.json", metrics)
 
 
