@@ -305,7 +305,8 @@ def _poses(path: Path, numbers: _Array, at: NDArray[np.int64]) -> Poses:
     if numbers.shape[1] == PLANE.pose_numbers:
         turn = np.stack([np.cos(numbers[:, 2]), np.sin(numbers[:, 2])], -1)
         return jaxlie.SE2(jax.device_put(np.concatenate([turn, numbers[:, :2]], -1)))
-    length = np.linalg.norm(numbers[:, 3:], axis=1)
+    with np.errstate(over="ignore"):  # an overflow gives an infinite length, which is refused
+        length = np.linalg.norm(numbers[:, 3:], axis=1)
     _refuse(path, at, np.abs(length - 1) > 0.1, "the quaternion's length is not 1")
     wxyz = numbers[:, [6, 3, 4, 5]] / length[:, None]
     return jaxlie.SE3(jax.device_put(np.concatenate([wxyz, numbers[:, :3]], -1)))

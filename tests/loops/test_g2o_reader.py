@@ -176,6 +176,14 @@ MISTAKES = {
         ],
         "line 1: the quaternion's length is not 1.",
     ),
+    "a quaternion whose length overflows": (
+        [
+            "VERTEX_SE3:QUAT 0 0 0 0 0 1e300 0 1",
+            f"EDGE_SE3:QUAT 0 1 {SPACE} {WEIGHTS}",
+            f"VERTEX_SE3:QUAT 1 {SPACE}",
+        ],
+        "line 1: the quaternion's length is not 1.",
+    ),
 }
 
 
