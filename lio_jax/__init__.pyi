@@ -87,5 +87,10 @@ from .tuning.optimise import parameter_covariance as parameter_covariance
 from .tuning.optimise import stationary as stationary
 from .tuning.parameters import free_parameters as free_parameters
 from .tuning.recording import Recording as Recording
+from .tuning.train import Schedule as Schedule
+from .tuning.train import Trained as Trained
+from .tuning.train import train as train
+from .tuning.tune import Tuned as Tuned
+from .tuning.tune import tune as tune
 
 __version__: str

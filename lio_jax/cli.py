@@ -318,6 +318,52 @@ def tune(
     command(data, validate, gt, out, options)
 
 
+@app.command(name="train")
+def train(
+    data: Positional[Annotated[tuple[Path, ...], arg(metavar="DATA")]],
+    params: Annotated[str, arg(metavar="GLOB,...")],
+    out: Annotated[Path, arg(metavar="DIR")],
+    objective: Annotated[
+        str | None, arg(metavar="NAME", help="As for tune. None means noise, or ate for loops and GPS.")
+    ] = None,
+    recipe: Recipe = None,
+    set_: Assignments = (),
+    validate: Annotated[tuple[Path, ...], arg(metavar="DATA ...")] = (),
+    gt: Annotated[Path | None, arg(metavar="FILE")] = None,
+    segment: Annotated[int, arg(metavar="N")] = 50,
+    batch: Annotated[int, arg(metavar="N")] = 4,
+    epochs: Annotated[int, arg(metavar="N")] = 20,
+    rate: Annotated[float, arg(metavar="X")] = 0.01,
+    patience: Annotated[int, arg(metavar="N")] = 5,
+    seed: Annotated[int, arg(metavar="K")] = 0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Train learned parts, such as a network in your own recipe, by steps on pieces of recordings.
+
+    Args:
+        data: Recordings to learn from.
+        params: Parameters, for example learned.weights; many numbers cost no more than a few.
+        out: Folder for trained.yaml, training.npz and training.png; an earlier training there is continued.
+        recipe: Recipe, settings file or class of your own recipe to start from; None as for run.
+        validate: Recordings that decide which epoch is taken and when to stop.
+        gt: Ground truth of T_world_imu; None means the recordings' own.
+        segment: Number of scans of a piece; each piece starts on its own.
+        batch: Number of pieces in one step.
+        epochs: Number of times that all pieces are used.
+        rate: First length of a step; it falls to zero until the last epoch.
+        patience: Number of epochs without a lower loss on --validate after which the training ends.
+        seed: Seed of the order of the pieces.
+        overwrite: Start again if the folder holds an earlier training.
+    """
+    from lio_jax.commands.runtime import prepare_jax
+    from lio_jax.commands.train import train as command
+    from lio_jax.tuning.train import Schedule
+
+    prepare_jax()
+    schedule = Schedule(batch, epochs, rate, patience, seed)
+    command(data, params, out, objective, recipe, set_, validate, gt, segment, schedule, overwrite)
+
+
 @app.command(name="ablate")
 def ablate(
     spec: Positional[Annotated[Path, arg(metavar="SPEC.yaml")]],

@@ -199,12 +199,33 @@ def stationary(evaluate: Evaluate, x: Vector, bounds: Bounds, iterations: int) -
             x, gradient = x + unit * step, there
 
 
+class Moments(NamedTuple):
+    """What Adam remembers of the gradients (Kingma & Ba 2015, algorithm 1)."""
+
+    mean: Vector
+    square: Vector
+    steps: int
+
+    @staticmethod
+    def none(size: int) -> "Moments":
+        """Return the moments before the first gradient."""
+        return Moments(np.zeros(size), np.zeros(size), 0)
+
+    def with_gradient(self, gradient: Vector) -> "Moments":
+        """Return the moments after one more gradient."""
+        mean = 0.9 * self.mean + 0.1 * gradient
+        return Moments(mean, 0.99 * self.square + 0.01 * gradient**2, self.steps + 1)
+
+    def direction(self) -> Vector:
+        """Return the direction to descend against: a component is near 1 where its gradients agree."""
+        mean = self.mean / (1 - 0.9**self.steps)
+        square = self.square / (1 - 0.99**self.steps)
+        return np.asarray(mean / (np.sqrt(square) + 1e-12), np.float64)
+
+
 def adam(segments: Iterator[Evaluate], x: Vector, bounds: Bounds, iterations: int, rate: float = 0.1) -> None:
     """Stochastic steps over random segments (Kingma & Ba 2015), the rate falling to a tenth at the end."""
-    mean, square = np.zeros_like(x), np.zeros_like(x)
+    moments = Moments.none(len(x))
     for iteration in range(1, iterations + 1):
-        gradient = next(segments)(x).gradient
-        mean = 0.9 * mean + 0.1 * gradient
-        square = 0.99 * square + 0.01 * gradient**2
-        scaled = (mean / (1 - 0.9**iteration)) / (np.sqrt(square / (1 - 0.99**iteration)) + 1e-12)
-        x = bounds.clip(x - rate * 0.1 ** (iteration / iterations) * scaled)
+        moments = moments.with_gradient(next(segments)(x).gradient)
+        x = bounds.clip(x - rate * 0.1 ** (iteration / iterations) * moments.direction())

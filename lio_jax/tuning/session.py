@@ -57,7 +57,7 @@ class Session:
 
     def __init__(
         self,
-        folder: Path,
+        folder: Path | None,
         free: ParameterVector,
         loss: Loss | CorrectedLoss,
         training: Listing[Recording],
@@ -69,7 +69,7 @@ class Session:
         """Take up the history that lies in the folder.
 
         Args:
-            folder: gets ``history.json`` after every evaluation.
+            folder: gets ``history.json`` after every evaluation; None: nothing is written.
             free: parameters that are tuned.
             loss: their loss.
             training: recordings to tune on.
@@ -81,12 +81,12 @@ class Session:
         Raises:
             LioJaxError: the history is that of other parameters.
         """
-        self._path = folder / HISTORY
+        self._path = None if folder is None else folder / HISTORY
         self._free, self._loss = free, loss
         self._training, self._validation = training, validation
         self._likelihood, self._patience, self._observer = likelihood, patience, observer
         self._unit: NDArray[np.float64] | None = None
-        self.history: list[Iterate] = _read(self._path, free) if self._path.exists() else []
+        self.history: list[Iterate] = _read(self._path, free) if self._path and self._path.exists() else []
 
     @property
     def best(self) -> Iterate:
@@ -179,6 +179,8 @@ class Session:
             yield partial(self.evaluate, recordings=[chosen])
 
     def _write(self) -> None:
+        if self._path is None:
+            return
         held: dict[str, Any] = {"names": self._free.names, "iterates": [asdict(one) for one in self.history]}
         with atomic_path(self._path) as aside:
             aside.write_text(json.dumps(held, indent=1) + "\n")

@@ -10,12 +10,12 @@ import yaml
 
 from lio_jax.cli import main
 from lio_jax.commands.run import resolve_settings
-from lio_jax.commands.tune import tuned_settings
 from lio_jax.data.native_writer import write_native
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
 from lio_jax.tuning.objective_names import SHORT
 from lio_jax.tuning.objectives import _SINGLE, objective_named
+from lio_jax.tuning.tune import given_tree
 from tests.data.foreign_files import LIO_SAM_ROS1
 
 SMALL = [
@@ -88,10 +88,10 @@ def test_the_tuned_file_repeats_what_was_given(tmp_path, theirs):
     words = ("params.extrinsics.translation=[0.1,0.2,0.3]", "config.lidar.buckets=[4096]")
     base = resolve_settings(str(ours), words, params_from)
     tuned = {"params.imu.gyro_noise": 1.234567890123e-3, "params.imu.accel_noise": 0.5}
-    out.write_text(yaml.safe_dump(tuned_settings(base, tuned)))
     expected = base
     for path, value in tuned.items():
         expected = expected.with_value(path, value, "test")
+    out.write_text(yaml.safe_dump(given_tree(expected)))
     assert resolve_settings(str(out), ()) == expected
 
 
