@@ -33,7 +33,7 @@ def train(
     base = resolve_settings(recipe, assignments, None)
     sequences, judges, truth = recordings_of(data, validate, gt, base)
     problem = problem_of(
-        sequences, patterns_in(params), objective, base, judges, truth, segment=segment, scores=False
+        sequences, patterns_in(params), objective, base, judges, truth, segment=segment, mode="reverse"
     )
     for note in problem.notes:
         say(f"note: {note}")

@@ -25,6 +25,9 @@ from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.reverse import TotalGradient, checkpointed_gradient
 from lio_jax.tuning.streaming import Gradient, objective_values, streaming_gradient
 
+Mode = Literal["auto", "forward", "reverse"]
+"""How a derivative is taken."""
+
 
 @dataclass(frozen=True)
 class NamedGradient:
@@ -47,7 +50,7 @@ def gradient(
     truth: Trajectory | None = None,
     start: int = 0,
     count: int | None = None,
-    mode: Literal["auto", "forward", "reverse"] = "auto",
+    mode: Mode = "auto",
     through_map: bool | None = None,
 ) -> NamedGradient:
     """Return the objective of a recording and its gradient.
@@ -132,8 +135,8 @@ _MOST_FORWARD = 32
 class Loss:
     """Mean objective over recordings, weighted by their numbers of scans.
 
-    Its gradient is by forward mode, or by reverse mode where there are so many parameters that this is
-    faster and nobody needs the scores.
+    Its gradient is by forward mode, or by reverse mode where that is wanted, or where there are so many
+    parameters that this is faster and nobody needs the scores.
     """
 
     def __init__(
@@ -144,11 +147,12 @@ class Loss:
         objective: Objective,
         through_map: bool = False,
         scores: bool = True,
+        mode: Mode = "auto",
     ) -> None:
         """Keep what the loss is of, whether its derivative goes through the map, and who needs scores."""
         self._loss_of = recipe_named(recipe)(config), free, objective
         self._through_map = through_map
-        self._forward = scores or len(free.names) <= _MOST_FORWARD
+        self._forward = mode == "forward" or (mode == "auto" and (scores or len(free.names) <= _MOST_FORWARD))
 
     def __call__(self, x: NDArray[np.float64], recordings: Listing[Recording]) -> Evaluated:
         """Return the loss at a vector of parameters, with its gradient."""

@@ -15,7 +15,7 @@ from lio_jax.run.fitted_settings import ring_count
 from lio_jax.run.run import settings_for
 from lio_jax.settings.settings import Settings
 from lio_jax.tuning.corrected import CorrectedLoss, free_of_back_end, names_back_end
-from lio_jax.tuning.gradient import Loss, wants_map
+from lio_jax.tuning.gradient import Loss, Mode, wants_map
 from lio_jax.tuning.objectives import Named, Objective, objective_named
 from lio_jax.tuning.optimise import Bounds
 from lio_jax.tuning.parameters import ParameterVector, free_parameters
@@ -103,7 +103,7 @@ def problem_of(
     start: int = 0,
     count: int | None = None,
     segment: int | None = None,
-    scores: bool = True,
+    mode: Mode = "auto",
 ) -> Problem:
     """Read the recordings and return the loss of the parameters over them.
 
@@ -118,7 +118,7 @@ def problem_of(
         start: first scan of each recording.
         count: number of scans of each; None: to the end.
         segment: cut the recordings into pieces of this many scans, each of which starts on its own.
-        scores: the scans' scores of a likelihood are wanted.
+        mode: of the derivative; auto and forward give the scans' scores of a likelihood.
 
     Raises:
         UsageError: a parameter or an objective is not known or has no derivative, truth is needed and
@@ -160,9 +160,7 @@ def problem_of(
     loss: Loss | CorrectedLoss = (
         CorrectedLoss(fitted, free, named.objective)
         if corrected
-        else Loss(
-            fitted.recipe, fitted.config, free, named.objective, through_map, scores and named.likelihood
-        )
+        else Loss(fitted.recipe, fitted.config, free, named.objective, through_map, named.likelihood, mode)
     )
     return Problem(
         given,

@@ -96,7 +96,7 @@ def train(
 ) -> Trained:
     """Train parameters of a recipe, such as a network's weights, on pieces of recordings.
 
-    With more than 32 numbers the gradients are by reverse mode. All pieces are kept in memory.
+    The gradients are by reverse mode. All pieces are kept in memory.
 
     Args:
         recordings: to learn from.
@@ -117,7 +117,7 @@ def train(
         LioJaxError: no batch of the first epoch has a finite loss, or nothing depends on the parameters.
     """
     problem = problem_of(
-        recordings, patterns, objective, settings, validate, truth, segment=segment, scores=False
+        recordings, patterns, objective, settings, validate, truth, segment=segment, mode="reverse"
     )
     session = TrainingSession(problem, schedule or Schedule(), out)
     session.run(observer)
