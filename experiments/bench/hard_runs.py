@@ -49,8 +49,13 @@ class Judged:
     """The time at which the run first knew each reason to doubt it, s since the first scan, and the reason."""
 
 
+_LIDAR_ONLY = ":lidar"
+"""Ends a recipe's name where it is to do without inertial samples."""
+
+
 def judged(sequence: Sequence, scans: Iterable[LidarScan], system: str, lidar_only: bool = False) -> Judged:
-    """Return the run of a recipe or of a peer over some scans."""
+    """Return the run of a recipe, ``NAME`` or ``NAME:lidar``, or of a peer over some scans."""
+    lidar_only, system = lidar_only or system.endswith(_LIDAR_ONLY), system.removesuffix(_LIDAR_ONLY)
     if system in PEERS:
         return Judged(peer_poses(sequence, scans, system), {"state": "-", "since_s": None})
     settings = recipe_settings(system)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from lio_jax.data.sequence import ImuData, LidarScan, Sequence
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.sim.assembly import Traffic, assembled, upright
 from lio_jax.sim.imu import ImuModel
+from lio_jax.sim.lidar import spinning_lidar
 from lio_jax.sim.sequence import SimulatedSequence
 from lio_jax.sim.traffic import car_boxes
 from lio_jax.sim.worlds import Route, Scene, World
@@ -113,25 +115,40 @@ def eight_beams_at_speed(seed: int) -> Sequence:
 
 
 def lift(seed: int) -> Sequence:
-    """Return a sensor at rest in a closed lift, which rises by 12 m after 3 s, at most 1.5 m/s fast."""
+    """Return a robot at rest in a closed lift, which rises by 14 m after 3 s, at most 1.6 m/s fast.
+
+    The acceleration reaches 1 m/s^2. The sensor looks down by 45 deg and sees the floor.
+    """
+    return _in_lift(seed, (-45.0, 45.0))
+
+
+def lift_without_floor(seed: int) -> Sequence:
+    """Return the same with a sensor that looks down by 25 deg: it sees the smooth walls alone."""
+    return _in_lift(seed, (-25.0, 15.0))
+
+
+def _in_lift(seed: int, elevation_deg: tuple[float, float]) -> Sequence:
     rng = np.random.default_rng([seed, 4])
-    center = np.array([0.1, -0.2, 1.1])
+    center = np.array([0.1, -0.2, 0.8])
     cabin = np.concatenate(
         [
-            upright([-0.9, -1.1, 0.0], [0.9, 1.1, 2.3], rng.uniform(0.3, 0.8)),
-            # handrail, panel and lamp
-            upright([0.8, -0.9, 0.9], [0.9, 0.9, 0.95], 0.8),
-            upright([-0.9, 0.6, 0.8], [-0.86, 0.9, 1.6], 0.6),
-            upright([-0.3, -0.3, 2.26], [0.3, 0.3, 2.3], 0.9),
+            upright([-1.0, -1.2, 0.0], [1.0, 1.2, 2.3], rng.uniform(0.3, 0.8)),
+            # handrail and panel
+            upright([0.9, -1.0, 0.9], [1.0, 1.0, 0.95], 0.8),
+            upright([-1.0, 0.7, 0.8], [-0.96, 1.0, 1.6], 0.6),
         ]
     )
-    inside = Scene(assembled(center, boxes=cabin), _nowhere())
-    at_rest = SimulatedSequence(
-        inside, duration_s=20.0, seed=seed, trajectory=_poses(np.zeros((10101, 3))), imu=ImuModel()
+    rest = _poses(np.zeros((10101, 3)))
+    inside = SimulatedSequence(
+        Scene(assembled(center, boxes=cabin), _nowhere()),
+        spinning_lidar(32, 1024, elevation_deg=elevation_deg, min_range=0.3),
+        duration_s=20.0,
+        seed=seed,
+        trajectory=rest,
+        imu=ImuModel(),
     )
     time = np.arange(10101) * _STEP_S
-    acceleration = _ramp(time, 3.0, 4.5) - _ramp(time, 9.5, 11.0)
-    height = _twice_summed(acceleration * 12.0 / 6.5)
+    height = 1.6 * _twice_summed(_ramp(time, 3.0, 6.2) - _ramp(time, 11.75, 14.95))
     rising = SimulatedSequence(
         Scene(assembled(np.zeros(3)), _nowhere()),
         duration_s=20.0,
@@ -139,7 +156,7 @@ def lift(seed: int) -> Sequence:
         trajectory=_poses(height[:, None] * [0.0, 0.0, 1.0]),
         imu=ImuModel(),
     )
-    return Carried(at_rest, rising)
+    return Carried(inside, rising)
 
 
 def long_tunnel(seed: int) -> Sequence:
@@ -260,13 +277,23 @@ HARD_SCENES: dict[str, Callable[[int], Sequence]] = {
     "a truck pulls away": truck_pulls_away,
     "8 beams at 15 m/s": eight_beams_at_speed,
     "a lift": lift,
+    "a lift, no floor seen": lift_without_floor,
     "a long tunnel": long_tunnel,
     "glass": glass_hall,
     "a quarter blocked": blocked_quarter,
     "5 s without scans": bend_without_scans,
     "a dropped robot": dropped_robot,
+    "drone over a field": lambda seed: _world(seed, world="field"),
+    "stairs": lambda seed: _world(seed, world="stairs"),
+    "8 beams in a street": lambda seed: _world(seed, world="street", beams=8),
+    "8 beams in a city": lambda seed: _world(seed, world="city", beams=8),
+    "office by hand, 4 rad/s": lambda seed: _world(seed, world="office", swing_rate=4.0),
 }
 """Recordings by name and seed."""
+
+
+def _world(seed: int, **arguments: Any) -> SimulatedSequence:
+    return SimulatedSequence(duration_s=20.0, seed=seed, imu=ImuModel(), **arguments)
 
 
 def _standing(world: World, seed: int) -> SimulatedSequence:
