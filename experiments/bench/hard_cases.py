@@ -10,7 +10,8 @@ python experiments/bench/hard_cases.py verdicts [--seeds 2] [--recording DRIVE A
 
 A scene ends as "inside" if the position's error never exceeds three of the standard deviations that the
 system states along it, as "small" if it never exceeds 0.5 m, as "warned" if the run itself names a reason to
-doubt it no later than that, and as "NO" otherwise. NAME:lidar is a recipe without inertial samples. A wrong set-up is found if a fault is named within 20 s. A start is right if every move after the
+doubt it no later than that, and as "NO" otherwise. NAME:lidar is a recipe without inertial samples. A wrong
+set-up is found if a fault is named within 20 s. A start is right if every move after the
 third scan is within 5 % of the true one, and the last position within 5 % of the way. A trajectory is wrong
 from the instant at which its error exceeds 1 m, or 0.3 m and 5 % of the way. A miss is a wrong trajectory
 that is called sound until then; a false alarm is a right one that is not called sound. --recipes takes the
@@ -179,7 +180,9 @@ TOLERATED_M, TOLERATED_SIGMAS = 0.5, 3.0
 def scenes(options: argparse.Namespace) -> list[Row]:
     """Return how each system fares in each hard scene: its error, its own opinion of it, and its warning."""
     rows: list[Row] = []
-    print("| system | scene | way, m | last, largest error, m | in sigmas | at 0.5 m: s | warned: s | outcome |")
+    print(
+        "| system | scene | way, m | last, largest error, m | in sigmas | at 0.5 m: s | warned: s | outcome |"
+    )
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for (name, build), seed in product(HARD_SCENES.items(), range(options.seeds)):
         if options.scenes and name not in options.scenes:
@@ -190,7 +193,7 @@ def scenes(options: argparse.Namespace) -> list[Row]:
             row = {"system": system, "scene": name, "seed": seed}
             try:
                 run = judged(sequence, scans, system, options.lidar_only)
-            except Exception as error:  # a peer may raise any exception; what a recipe raises is an error here
+            except Exception as error:  # a peer may raise any exception
                 if system not in PEERS:
                     raise
                 rows.append(row | {"outcome": "refused", "words": " ".join(str(error).split())})

@@ -46,7 +46,7 @@ class Judged:
     sigma: float | None = None
     """Standard deviation of the last position, m."""
     warnings: list[tuple[float, str]] = field(default_factory=list)
-    """The time at which the run first knew each reason to doubt it, s since the first scan, and the reason."""
+    """Each reason to doubt the run, after the time at which it was first known, s since the first scan."""
 
 
 _LIDAR_ONLY = ":lidar"

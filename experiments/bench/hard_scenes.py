@@ -80,7 +80,7 @@ class Carried(Changed):
 def passing_cars(seed: int) -> Sequence:
     """Return a vehicle that waits in the middle of a road while a dense stream of cars passes on both sides.
 
-    The stream moves off at once with the recording: cars of 8 to 10 m/s on the left, 9 to 14 m/s on the right.
+    The cars on the left drive at 8 to 10 m/s, those on the right at 9 to 14 m/s.
     """
     rng = np.random.default_rng([seed, 1])
     lanes = [(2.95, np.pi, rng.uniform(8, 10)), (-2.95, 0.0, rng.uniform(9, 14))]
@@ -109,9 +109,7 @@ def eight_beams_at_speed(seed: int) -> Sequence:
     scene = road_scene("street", 0.0, 170.0, seed)
     points = np.array([[0.0, 0.0, 0.0], [210.0, 0.0, 0.0]])
     route = Route(points, closed=False, radius=5.0, speed=15.0, dynamics="car")
-    return SimulatedSequence(
-        Scene(scene.world, route), duration_s=12.0, seed=seed, beams=8, imu=ImuModel()
-    )
+    return SimulatedSequence(Scene(scene.world, route), duration_s=12.0, seed=seed, beams=8, imu=ImuModel())
 
 
 def lift(seed: int) -> Sequence:
@@ -374,13 +372,11 @@ def _behind_board(number: int, scan: LidarScan) -> LidarScan:
     noise = np.random.default_rng(number).normal(0, 0.02, len(points))
     met = -0.7 / np.where(hidden, rays[:, 0], -1.0) + noise
     nearer = hidden & (met < ranges)
-    return replace(
-        scan, points=np.where(nearer[:, None], met[:, None] * rays, points).astype(np.float32)
-    )
+    return replace(scan, points=np.where(nearer[:, None], met[:, None] * rays, points).astype(np.float32))
 
 
 def _ramp(time: NDArray[np.float64], begin: float, end: float) -> NDArray[np.float64]:
-    """Return an acceleration that rises and falls smoothly from ``begin`` to ``end`` s and sums up to 1 m/s."""
+    """Return a smooth acceleration from ``begin`` to ``end`` s that sums up to 1 m/s, m/s^2."""
     share = np.clip((time - begin) / (end - begin), 0, 1)
     return 2 * np.sin(np.pi * share) ** 2 / (end - begin)
 
@@ -391,9 +387,7 @@ def _twice_summed(acceleration: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([[0.0], np.cumsum(velocity[1:] + velocity[:-1]) * _STEP_S / 2])
 
 
-def _poses(
-    places: NDArray[np.float64], rotations: NDArray[np.float64] | None = None
-) -> Trajectory:
+def _poses(places: NDArray[np.float64], rotations: NDArray[np.float64] | None = None) -> Trajectory:
     """Return a motion through positions (n, 3) m at equal steps, in the world's axes if no rotations are
     given."""
     poses = np.tile(np.eye(4), (len(places), 1, 1))

@@ -146,8 +146,8 @@ _AFTER_LATER, _WAY_LATER = 5, 10.0
 """Number of scans after any other reference at which the motion is compared, less if the way would be longer
 than this, m."""
 _AFTER_SLOW, _SLOW_M = 10, 2.0
-"""Number of scans after such a reference at which the motion is compared once more where the estimate is slow:
-over so many scans it moves less than this way, m. A match that stays behind a vehicle that moves off is
+"""Number of scans after such a reference at which the motion is compared once more where the estimate is
+slow: over so many scans it moves less than this way, m. A match that stays behind a vehicle that moves off is
 noticed earlier over a longer time."""
 _TURNING = 0.02
 """A turn between two scans above which the motion is compared too, rad: a wrong gyroscope shows in turns."""

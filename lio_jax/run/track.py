@@ -59,7 +59,7 @@ class ScanResult:
     motion_is_hidden: bool | None = None
     """Whether that comparison shows no motion without doubt; None where nothing was compared."""
     felt_motion: FeltMotion | None = None
-    """How the estimated motion differs from what the inertial samples feel; None where it was not compared."""
+    """How the estimated motion differs from what inertial samples feel; None where it was not compared."""
     has_imu: bool = False
     """Whether inertial samples predicted the pose."""
     outage: BridgedOutage | None = None

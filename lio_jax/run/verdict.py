@@ -204,7 +204,8 @@ class Verdict(Sink):
         if len(seen.nis) < _WINDOW:
             return
         mean, now = fmean(seen.nis), median(seen.nis)
-        before = seen.earlier_nis[len(seen.earlier_nis) // 2] if seen.earlier_nis else np.inf
+        enough = len(seen.earlier_nis) >= _WINDOW
+        before = seen.earlier_nis[len(seen.earlier_nis) // 2] if enough else np.inf
         if mean > _LARGEST_NIS or now > max(_RAISED_NIS, _RAISED_RATIO * before):
             self._doubt(
                 "innovation",

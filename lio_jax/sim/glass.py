@@ -17,7 +17,7 @@ from lio_jax.sim.primitives import Panes
 from lio_jax.sim.raycast import Hit
 
 _HEAD_ON = float(np.cos(np.deg2rad(2.0)))
-"""Cosine of the incidence up to which the pane itself answers, because its mirrored light meets the sensor."""
+"""Cosine of the incidence up to which the pane itself answers: its mirrored light meets the sensor."""
 _BEHIND = 1e-6
 """Distance from the pane at which a mirrored ray starts, m."""
 
