@@ -32,6 +32,8 @@ class Posed(NamedTuple):
     lost: bool = False
     failed: bool = False
     """Whether the run names a failure of this scan."""
+    covariance: NDArray[np.float64] | None = None
+    """(3, 3) covariance of the position along the body's axes, m^2; None where the system states none."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +45,17 @@ class Judged:
     faults: list[Fault] = field(default_factory=list)
     sigma: float | None = None
     """Standard deviation of the last position, m."""
+    warnings: list[tuple[float, str]] = field(default_factory=list)
+    """Each reason to doubt the run, after the time at which it was first known, s since the first scan."""
+
+
+_LIDAR_ONLY = ":lidar"
+"""Ends a recipe's name where it is to do without inertial samples."""
 
 
 def judged(sequence: Sequence, scans: Iterable[LidarScan], system: str, lidar_only: bool = False) -> Judged:
-    """Return the run of a recipe or of a peer over some scans."""
+    """Return the run of a recipe, ``NAME`` or ``NAME:lidar``, or of a peer over some scans."""
+    lidar_only, system = lidar_only or system.endswith(_LIDAR_ONLY), system.removesuffix(_LIDAR_ONLY)
     if system in PEERS:
         return Judged(peer_poses(sequence, scans, system), {"state": "-", "since_s": None})
     settings = recipe_settings(system)
@@ -56,17 +65,23 @@ def judged(sequence: Sequence, scans: Iterable[LidarScan], system: str, lidar_on
     imu, _ = imu_feed(sequence, settings)
     results, run, covariance = [], RunResult(), None
     check, judge = SetUpCheck(settings, imu.samples if imu else None), Verdict(settings)
+    warnings: dict[str, float] = {}
+    first_ns: int | None = None
     for result in track(settings, scans, imu):
         check.take(result)
         judge.take(result)
+        first_ns = result.stamp_ns if first_ns is None else first_ns
+        for reason in [*judge.verdict()["reasons"], *(fault.sentence for fault in check.faults.values())]:
+            warnings.setdefault(reason, (result.stamp_ns - first_ns) * 1e-9)
         covariance = result.output.covariance
-        results.append(
-            Posed(result.stamp_ns, result.T_world_imu, bool(result.output.lost), bool(result.failure))
-        )
+        position = None if covariance is None else np.asarray(covariance)[3:6, 3:6]
+        lost, failed = bool(result.output.lost), bool(result.failure)
+        results.append(Posed(result.stamp_ns, result.T_world_imu, lost, failed, position))
     check.finish(run)
     judge.finish(run)
     sigma = None if covariance is None else float(np.sqrt(np.trace(np.asarray(covariance)[3:6, 3:6])))
-    return Judged(results, run.metrics["verdict"], list(check.faults.values()), sigma)
+    in_turn = sorted((since, reason) for reason, since in warnings.items())
+    return Judged(results, run.metrics["verdict"], list(check.faults.values()), sigma, in_turn)
 
 
 def peer_poses(sequence: Sequence, scans: Iterable[LidarScan], name: str) -> list[Posed]:
@@ -110,6 +125,28 @@ def relative(results: list[Posed], sequence: Sequence) -> tuple[np.ndarray, np.n
     true = truth.at(stamps)
     poses = np.array([one.T_world_imu for one in results])[np.isin(stamps, true.stamp_ns)]
     return np.linalg.inv(poses[0]) @ poses, np.linalg.inv(true.poses[0]) @ true.poses
+
+
+def in_sigmas(
+    results: list[Posed], estimated: NDArray[np.float64], true: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the errors of positions over the standard deviations that the system states along them, (n,).
+
+    Args:
+        results: n of them.
+        estimated: (n, 4, 4) poses, relative to the first.
+        true: the same of the truth.
+    """
+    ratios = np.zeros(len(results))
+    for row, one in enumerate(results):
+        error = estimated[row, :3, :3].T @ (estimated - true)[row, :3, 3]
+        length = float(np.linalg.norm(error))
+        if one.covariance is None or not np.isfinite(one.covariance).all():
+            ratios[row] = np.nan
+        elif length > 0:
+            unit = error / length
+            ratios[row] = length / np.sqrt(max(unit @ one.covariance @ unit, 1e-12))
+    return ratios
 
 
 def moves(poses: np.ndarray) -> np.ndarray:

@@ -145,6 +145,10 @@ since then is compared."""
 _AFTER_LATER, _WAY_LATER = 5, 10.0
 """Number of scans after any other reference at which the motion is compared, less if the way would be longer
 than this, m."""
+_AFTER_SLOW, _SLOW_M = 10, 2.0
+"""Number of scans after such a reference at which the motion is compared once more where the estimate is
+slow: over so many scans it moves less than this way, m. A match that stays behind a vehicle that moves off is
+noticed earlier over a longer time."""
 _TURNING = 0.02
 """A turn between two scans above which the motion is compared too, rad: a wrong gyroscope shows in turns."""
 _DISTORTED = 0.05
@@ -249,7 +253,8 @@ class MotionCheck:
         if turning:
             self._turns, self._next_turn = self._turns + 1, index + _BETWEEN_TURNS
         later = int(np.clip(_WAY_LATER / max(step, 1e-3), 1, _AFTER_LATER))
-        after = _AFTER if turning or reference is None else (later,)
+        slow = (_AFTER_SLOW,) if _AFTER_SLOW * step < _SLOW_M else ()
+        after = _AFTER if turning or reference is None else (later, *slow)
         self._reference = _Reference(index, view, T_world_lidar, after, turned)
         self._next = index + (_EVERY_AT_FIRST if index < _FIRST else _EVERY)
         return look

@@ -21,6 +21,7 @@ from lio_jax.recipes.recipe import CorrectingRecipe, PagingRecipe
 from lio_jax.recipes.transforms import RecipeLike, Stepper, reopened, with_first_velocity
 from lio_jax.run.failures import BridgedOutage, OutageWatch, ScanEvidence, failure_of, longest_gap
 from lio_jax.run.feedback import Feedback
+from lio_jax.run.felt_motion import FeltMotion, FeltMotionCheck
 from lio_jax.run.journal import Journal
 from lio_jax.run.paging import KeyframePager, Pager
 from lio_jax.run.scan_inputs import ImuFeed, InputsInTurn, ScanInput
@@ -57,6 +58,8 @@ class ScanResult:
     """What plan views show of the motion since an earlier scan; None where it was not compared."""
     motion_is_hidden: bool | None = None
     """Whether that comparison shows no motion without doubt; None where nothing was compared."""
+    felt_motion: FeltMotion | None = None
+    """How the estimated motion differs from what inertial samples feel; None where it was not compared."""
     has_imu: bool = False
     """Whether inertial samples predicted the pose."""
     outage: BridgedOutage | None = None
@@ -225,6 +228,7 @@ class ResultBuilder:
         self._settings = settings
         self._before: ScanEvidence | None = None
         self._check = MotionCheck()
+        self._felt = FeltMotionCheck()
         self._outages = OutageWatch()
 
     def __call__(
@@ -253,13 +257,15 @@ class ResultBuilder:
         )
         failure = failure_of(evidence, self._before, self._settings)
         self._before = evidence
+        T_world_imu = pose_matrix(nav.T_world_imu.wxyz_xyz)
         T_world_lidar = pose_matrix(registration.T_world_lidar.wxyz_xyz)
         unmatched = evidence.lost or not fed.usable
         look = self._check(fed.index, fed.scan, T_world_lidar, unmatched)
+        breaks = unmatched or evidence.new_piece or evidence.restarted or bool(registration.degenerate.any())
         return ScanResult(
             index=fed.index,
             stamp_ns=fed.end_ns,
-            T_world_imu=pose_matrix(nav.T_world_imu.wxyz_xyz),
+            T_world_imu=T_world_imu,
             nav=nav,
             output=output,
             scan_points=fed.count,
@@ -269,6 +275,7 @@ class ResultBuilder:
             beams=None if fed.index % _BEAMS_EVERY else beams_of(fed.scan),
             shown_motion=look.shown,
             motion_is_hidden=look.is_hidden,
+            felt_motion=self._felt(fed.end_ns, fed.scan, fed.imu, nav, T_world_imu, breaks),
             has_imu=fed.imu is not None,
             outage=self._outages(fed.end_ns, evidence, output.covariance),
             raw=_some(np.asarray(fed.scan.points)[: fed.count]),

@@ -1,5 +1,6 @@
 """The judgement on a whole run: sound, doubtful from an instant on, or lost from an instant on."""
 
+from bisect import insort
 from collections import deque
 from dataclasses import dataclass, field
 from statistics import fmean, median
@@ -28,6 +29,13 @@ _UNCONVERGED = 0.5
 """Share of the window's scans that may end without convergence."""
 _LARGEST_NIS = 25.0
 """Largest mean of the normalised innovation per degree of freedom over the window; 1 is expected."""
+_RAISED_NIS, _RAISED_RATIO = 5.0, 3.0
+"""Median of the normalised innovation per degree of freedom over the window that counts, and its ratio to the
+median of all scans before the window: a filter whose noise is set too small has a high one from the start."""
+_FELT_M, _FELT_NOISES = 0.3, 4.0
+"""Difference of the estimated from the felt motion that counts, m, and over the median of those before."""
+_VERTICAL = 0.9
+"""Share of that difference along the vertical from which it is called vertical."""
 _LOST_S = 1.0
 """Time without a match at the end of a run from which it ends lost, s."""
 _STRONGEST, _ROUGHEST = 30.0, 10.0
@@ -39,6 +47,10 @@ _UNOBSERVED_M = 20.0
 _UNOBSERVED_S = 5.0
 """Time with an unobserved direction that inertial samples bridge, s: an attitude that is 0.5 deg off moves
 the position by 1 m in it."""
+_UNMEASURED_S, _UNMEASURED_M = 1.5, 0.5
+"""Time with an unobserved direction that is tolerated without inertial samples, s, and three standard
+deviations of the position, m: a vehicle that accelerates by 0.5 m/s^2 moves by 0.5 m in this time, and the
+velocity of before does not show it."""
 _SIGMAS = 4.0
 """Such a time counts where so many standard deviations of the position exceed the tolerated error."""
 _HIDDEN_LOOKS = 2
@@ -64,6 +76,9 @@ class _Evidence:
     accelerations: deque[float] = field(default_factory=lambda: deque(maxlen=_ROUGH_SCANS))
     unconverged: deque[bool] = field(default_factory=lambda: deque(maxlen=_WINDOW))
     nis: deque[float] = field(default_factory=lambda: deque(maxlen=_WINDOW))
+    earlier_nis: list[float] = field(default_factory=list)
+    """Those before the window."""
+    felt_errors: list[float] = field(default_factory=list)
 
 
 class Verdict(Sink):
@@ -90,6 +105,7 @@ class Verdict(Sink):
         sigma = _sigma(result.output.covariance)
         self._note_outage(result, sigma)
         self._note_motion(result)
+        self._note_felt(result)
         self._note_window(result, sigma)
         self._note_unobserved(result, step, sigma)
         self._note_hidden(result, step)
@@ -127,7 +143,8 @@ class Verdict(Sink):
 
     def _note_outage(self, result: ScanResult, sigma: float | None) -> None:
         output, before = result.output, self._before
-        lost = bool(output.lost)
+        # a scan that begins the map is matched with nothing, and no other one should be
+        lost = bool(output.lost) or (before is not None and int(output.registration.matches) == 0)
         unmatched = self._seen.unmatched_since_s
         if lost and unmatched is None and before is not None:
             unmatched = (before.stamp_ns - (self._first_ns or 0)) * 1e-9
@@ -172,17 +189,48 @@ class Verdict(Sink):
             )
         freedom = int(output.nis_dof)
         if freedom and status == CONVERGED:
-            seen.nis.append(float(output.nis) / freedom)
-        if len(seen.nis) == _WINDOW and (mean := fmean(seen.nis)) > _LARGEST_NIS:
-            self._doubt(
-                "innovation",
-                f"around {self._now_s:.1f} s the scans contradict the prediction by inertial samples "
-                f"(normalised innovation {mean:.0f} times what is expected)",
-            )
+            self._note_innovation(float(output.nis) / freedom)
         if sigma is not None and sigma > max(TOLERATED_M, TOLERATED_SHARE * seen.way):
             self._doubt("covariance", f"the position's standard deviation reached {sigma:.1f} m")
         if _is_true(output.restarted):
             self._doubt("restart", f"at {self._now_s:.1f} s velocity or biases ran away and began anew")
+
+    def _note_innovation(self, nis: float) -> None:
+        """Look for innovations that are too large in general, or much larger than before."""
+        seen = self._seen
+        if len(seen.nis) == _WINDOW:
+            insort(seen.earlier_nis, seen.nis[0])
+        seen.nis.append(nis)
+        if len(seen.nis) < _WINDOW:
+            return
+        mean, now = fmean(seen.nis), median(seen.nis)
+        enough = len(seen.earlier_nis) >= _WINDOW
+        before = seen.earlier_nis[len(seen.earlier_nis) // 2] if enough else np.inf
+        if mean > _LARGEST_NIS or now > max(_RAISED_NIS, _RAISED_RATIO * before):
+            self._doubt(
+                "innovation",
+                f"around {self._now_s:.1f} s the scans contradict the prediction by inertial samples "
+                f"(normalised innovation {mean:.0f} times what is expected): the surroundings may move with "
+                "the sensor, as in a lift, or something that moves fills the view",
+            )
+
+    def _note_felt(self, result: ScanResult) -> None:
+        """Compare the estimated motion with the one that the inertial samples feel."""
+        felt, errors = result.felt_motion, self._seen.felt_errors
+        if felt is None:
+            return
+        error = float(np.linalg.norm(felt.error))
+        noise = errors[len(errors) // 2] if errors else 0.0
+        insort(errors, error)
+        if error > max(_FELT_M, _FELT_NOISES * noise):
+            begin = (felt.start_ns - (self._first_ns or 0)) * 1e-9
+            along = "upwards or downwards " if abs(felt.error[2]) > _VERTICAL * error else ""
+            self._doubt(
+                "felt",
+                f"from {begin:.1f} s to {self._now_s:.1f} s the inertial samples feel another acceleration "
+                f"{along}than the estimated one, worth {error:.1f} m: the surroundings may move with the "
+                "sensor, as in a lift, or the scan match is wrong",
+            )
 
     def _note_unobserved(self, result: ScanResult, step: float, sigma: float | None) -> None:
         output, seen = result.output, self._seen
@@ -198,6 +246,13 @@ class Verdict(Sink):
                 f"{seen.unobserved_m:.0f} m",
             )
         since_s = self._now_s - seen.observed_s
+        open_by_scans = weak and not result.has_imu and since_s > _UNMEASURED_S
+        if open_by_scans and sigma is not None and 3 * sigma > _UNMEASURED_M:
+            self._doubt(
+                "unobserved",
+                f"up to {self._now_s:.1f} s no scan showed one direction of the motion for {since_s:.1f} s, "
+                f"no inertial samples bridge it, and the position's standard deviation is {sigma:.1f} m",
+            )
         if weak and sigma is not None and since_s > _UNOBSERVED_S and _SIGMAS * sigma > TOLERATED_M:
             self._doubt(
                 "unobserved",

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import ArrayLike, NDArray
 
-from lio_jax.sim.primitives import Boxes, Cylinders, Grounds, Planes, Spheres, TiltedBoxes
+from lio_jax.sim.primitives import Boxes, Cylinders, Grounds, Panes, Planes, Spheres, TiltedBoxes
 from lio_jax.sim.worlds import Movers, Solids, World
 
 Rows = NDArray[np.float64] | Sequence[Sequence[float | int]]
@@ -64,6 +64,7 @@ def assembled(
     cylinders: Rows = (),
     spheres: Rows = (),
     traffic: Traffic | None = None,
+    glass: Rows = (),
 ) -> World:
     """Return the world whose origin is at ``origin`` of the builder's frame.
 
@@ -76,6 +77,7 @@ def assembled(
         cylinders: rows of base centre 3, radius, height, reflectivity.
         spheres: rows of centre 3, radius, reflectivity.
         traffic: the bodies that move; None: nothing moves.
+        glass: rows of centre 3, half of one edge 3, half of the other edge 3, mirrored share, missing share.
 
     Returns:
         The world in float64 arrays, in every mode of JAX; angles in rad, lengths in m.
@@ -94,7 +96,9 @@ def assembled(
         Cylinders(*_double([base - origin, *cylinder])),
         Spheres(*_double([heart - origin, *sphere])),
     )
-    return World(solids, _movers(traffic, origin))
+    middle, *pane = _columns(glass, 3, 3, 3, 1, 1)
+    panes = Panes(*_double([middle - origin, *pane])) if len(middle) else None
+    return World(solids, _movers(traffic, origin), panes)
 
 
 def upright(

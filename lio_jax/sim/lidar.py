@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from numpy.typing import NDArray
 
+from lio_jax.sim.glass import seen_through
 from lio_jax.sim.raycast import cast
 from lio_jax.sim.worlds import Part
 
@@ -195,6 +196,15 @@ def sweep(
     origins, rays = _rays(lidar, T_world_column, directions)
     time = outer_sum(column_times(lidar), np.array(lidar.delay_ns) * 1e-9)
     hit = cast(part, origins, rays, time.ravel())
+    if part.glass is not None:
+        hit = seen_through(
+            part.glass,
+            lambda starts, ways: cast(part, starts, ways, time.ravel()),
+            origins,
+            rays,
+            hit,
+            jax.random.fold_in(key, 2),
+        )
     model = lidar.ranging
     cosine = -jnp.sum(hit.normal * rays, axis=1)
     answer = hit.reflectivity * cosine

@@ -103,3 +103,22 @@ class Spheres(eqx.Module):
     def moved(self, by: Float[Array, "3"]) -> "Spheres":
         """Return the balls displaced by ``by`` (m)."""
         return Spheres(self.center + by, self.radius, self.reflectivity)
+
+
+class Panes(eqx.Module):
+    """Rectangular panes of glass."""
+
+    center: Float[Array, "n 3"]
+    """Centre of each pane, world frame, m."""
+    along: Float[Array, "n 3"]
+    """Half of one edge, world frame, m."""
+    up: Float[Array, "n 3"]
+    """Half of the other edge, perpendicular to the first, world frame, m."""
+    mirror: Float[Array, " n"]
+    """Share of the light that is mirrored head-on, 0 to 1; 0.08 for a plain pane, with its two faces."""
+    missing: Float[Array, " n"]
+    """Share of the rays that pass the pane and never come back, 0 to 1."""
+
+    def moved(self, by: Float[Array, "3"]) -> "Panes":
+        """Return the panes displaced by ``by`` (m)."""
+        return Panes(self.center + by, self.along, self.up, self.mirror, self.missing)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
-from lio_jax.sim.primitives import Boxes, Cylinders, Grounds, Planes, Spheres, TiltedBoxes
+from lio_jax.sim.primitives import Boxes, Cylinders, Grounds, Panes, Planes, Spheres, TiltedBoxes
 
 
 class Movers(eqx.Module):
@@ -84,6 +84,8 @@ class World(eqx.Module):
 
     solids: Solids
     movers: Movers
+    glass: Panes | None = None
+    """Panes of glass; None: there are none."""
 
 
 class Part(eqx.Module):
@@ -91,6 +93,7 @@ class Part(eqx.Module):
 
     solids: Solids
     moving: MovingBoxes
+    glass: Panes | None = None
 
 
 class Counts(NamedTuple):
@@ -137,6 +140,7 @@ def nearest_part(
             spheres.moved(-position),
         ),
         moving_boxes(world.movers, time).moved(-position),
+        None if world.glass is None else world.glass.moved(-position),
     )
     reach = jnp.min(jnp.stack([box_reach, tilted_reach, cylinder_reach, sphere_reach]))
     return part, reach

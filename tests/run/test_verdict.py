@@ -9,6 +9,7 @@ import pytest
 
 from lio_jax.cli import main
 from lio_jax.data.detect import open_sequence
+from lio_jax.run.felt_motion import FeltMotion
 from lio_jax.run.run import settings_for
 from lio_jax.run.scan_inputs import padded
 from lio_jax.run.shown_motion import MotionCheck, ShownMotion
@@ -227,3 +228,70 @@ def test_summary_metrics_and_report_state_the_verdict(tmp_path, capsys):
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["verdict"] == {"state": "sound", "since_s": None, "reasons": []}
     assert "verdict" in (out / "report.html").read_text()
+
+
+def drives_on(results, count, **changes):
+    """Return results and ``count`` more, at the same speed; each change is a function of the number."""
+    last = replace(results[-1], felt_motion=None)
+    for number in range(1, count + 1):
+        here = {name: change(number) for name, change in changes.items()}
+        yield replace(moved(last, number, 0.5 * number), **here)
+
+
+@pytest.mark.parametrize(("error", "is_doubted"), [(0.25, False), (0.4, True)])
+def test_another_motion_than_the_felt_one_is_noticed_at_once(error, is_doubted):
+    settings, results = tracked(road("street", 5.0, 0.0, 8), "default")
+
+    def felt(number):
+        return FeltMotion(np.array([0.0, 0.0, error if number > 8 else 0.02]), results[0].stamp_ns)
+
+    found = verdict_of(settings, [*results, *drives_on(results, 10, felt_motion=felt)])
+    assert (found["state"] != "sound") == is_doubted
+    if is_doubted:
+        assert found["since_s"] == pytest.approx(0.7 + 0.9, abs=0.01)
+        assert "upwards or downwards" in found["reasons"][0]
+        assert "lift" in found["reasons"][0]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "is_doubted"),
+    [(0.3, 8.0, True), (0.3, 4.0, False), (6.0, 14.0, False)],
+    ids=["raised", "not by much", "always high"],
+)
+def test_innovations_that_rise_over_their_own_level_are_noticed(before, after, is_doubted):
+    settings, results = tracked(road("street", 5.0, 0.0, 8), "default")
+    output = results[-1].output
+
+    def measured(number):
+        nis = before if number <= 45 else after
+        return replace(output, nis=jnp.float64(6 * nis), nis_dof=jnp.int32(6))
+
+    found = verdict_of(settings, [*results[:1], *drives_on(results, 65, output=measured)])
+    assert any("contradict" in reason for reason in found["reasons"]) == is_doubted
+
+
+def test_a_run_whose_scans_match_nothing_is_lost():
+    settings, results = tracked(road("street", 5.0, 0.0, 8), "default")
+    output = results[-1].output
+    nothing = replace(output, registration=replace(output.registration, matches=jnp.int32(0)))
+    found = verdict_of(settings, [*results, *drives_on(results, 12, output=lambda number: nothing)])
+    assert (found["state"], found["since_s"]) == ("lost", pytest.approx(0.7))
+
+
+@pytest.mark.parametrize(
+    ("sigma", "has_imu", "is_doubted"), [(0.2, False, True), (0.1, False, False), (0.2, True, False)]
+)
+def test_without_inertial_samples_a_hidden_direction_is_doubtful_earlier(sigma, has_imu, is_doubted):
+    settings, results = tracked(road("street", 5.0, 0.0, 8), "default")
+    output = results[-1].output
+    blind = replace(
+        output,
+        registration=replace(output.registration, degenerate=jnp.arange(6) == 0),
+        covariance=jnp.diag(jnp.array([1e-6] * 3 + [sigma**2] * 3 + [1e-6] * 18)),
+    )
+    onwards = drives_on(results, 17, output=lambda number: blind, has_imu=lambda number: has_imu)
+    found = verdict_of(settings, [*results, *onwards])
+    assert (found["state"] != "sound") == is_doubted
+    if is_doubted:
+        assert found["since_s"] == pytest.approx(0.7 + 1.6, abs=0.01)
+        assert "no inertial samples bridge it" in found["reasons"][0]
