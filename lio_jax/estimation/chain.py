@@ -113,9 +113,7 @@ def linearise(
     start = jax.tree.map(lambda rows: rows[:-1], states)
     end = jax.tree.map(lambda rows: rows[1:], states)
 
-    def over(
-        quadratic: Callable[..., Quadratic], dof: int, there: Array, row: Any, *of: Any
-    ) -> Quadratic:
+    def over(quadratic: Callable[..., Quadratic], dof: int, there: Array, row: Any, *of: Any) -> Quadratic:
         terms = jax.vmap(_to_second_order(quadratic, dof) if exact else quadratic)(row, *of)
         return jax.tree.map(lambda leaf: jnp.where(_column(there, leaf), leaf, 0.0), terms)
 

@@ -219,8 +219,7 @@ def moved_by(window: Window, T_new_old: jaxlie.SE3) -> Window:
             which is gravity without its tilt.
     """
     chain, prior = window.chain, window.chain.prior
-    axes = sphere_basis(chain.gravity)[:, : len(window.tilt)]
-    turn = axes.T @ rotation_matrix(T_new_old.rotation()) @ axes
+    turn = turn_of_tilt(chain.gravity, T_new_old)[: len(window.tilt), : len(window.tilt)]
     unknowns = jax.scipy.linalg.block_diag(jnp.eye(DOF, dtype=turn.dtype), turn)
     moved = Prior(
         origin=prior.origin.moved_by(T_new_old),
@@ -235,6 +234,17 @@ def moved_by(window: Window, T_new_old: jaxlie.SE3) -> Window:
         (moved, T_new_old @ chain.lidar.T_world_imu),
     )
     return Window(chain, window.states.moved_by(T_new_old), turn @ window.tilt)
+
+
+def turn_of_tilt(gravity: Float[Array, "3"], T_new_old: jaxlie.SE3) -> Float[Array, "2 2"]:
+    """Return the matrix by which the tilt of gravity turns with the world.
+
+    Args:
+        gravity: without the tilt, m/s^2.
+        T_new_old: from the old world to the new one; its rotation is about ``gravity``.
+    """
+    axes = sphere_basis(gravity)
+    return axes.T @ rotation_matrix(T_new_old.rotation()) @ axes
 
 
 def _moved_up(rows: Array) -> Array:
