@@ -82,4 +82,6 @@ def test_another_world_frame_changes_no_cost(along):
     before, after = normal(window), normal(moved_by(window, T_new_old))
     np.testing.assert_allclose(after.cost, before.cost, rtol=1e-9)
     np.testing.assert_allclose(after.gradient, before.gradient, rtol=1e-6, atol=1e-6 * before.cost)
-    np.testing.assert_allclose(after.matrix.chain.diagonal, before.matrix.chain.diagonal, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        after.matrix.chain.diagonal, before.matrix.chain.diagonal, rtol=1e-6, atol=1e-6
+    )
