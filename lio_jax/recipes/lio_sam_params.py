@@ -61,7 +61,7 @@ class LioSamParams(InertialParams):
     map: FeatureMapParams = section(FeatureMapParams, voxel_size=0.4, corner_voxel_size=0.2)
     registration: LioSamMatch = section(
         LioSamMatch,
-        information_scale=0.3,
+        information_scale=1.0,
         reassociation_distance=0.05,
         rotation_tolerance=0.05 * _DEGREE,
         translation_tolerance=5e-4,

@@ -55,7 +55,7 @@ from lio_jax.registration.scan_match import FixedPoints
 
 _TIME_SLACK = 1e-3
 """Sweeps do not end to the last bit in time, s."""
-_PLANE_SHARE = 3.0
+_PLANE_SHARE = 5.0
 """Variance of the pose by the errors of the map's lines and planes, as a share of that by a match."""
 
 

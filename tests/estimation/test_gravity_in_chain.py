@@ -26,8 +26,8 @@ from tests.estimation.linear_chain import GRAVITY, PRIOR_SIGMA, linear_chain
 from tests.imu.motion import quick_jit
 
 ROWS, CAPACITY = 7, 4
-TILT_SIGMA = 0.05
-TRUE_TILT = jnp.array([0.02, -0.03])
+TILT_SIGMA = 0.01
+TRUE_TILT = jnp.array([0.002, -0.003])
 
 
 def row_of(tree, row):
@@ -39,9 +39,15 @@ def tilted_chain():
     """Return a chain whose prior leaves gravity's direction open, and a guess of its states."""
     chain, guess, _ = linear_chain(ROWS)
     start = row_of(guess, 0)
-    sigma = np.concatenate([PRIOR_SIGMA, np.full(2, TILT_SIGMA)])
+    # rotations that are known to 1e-9 rad would leave rounding errors of the size of a tilt
+    sigma = np.concatenate([np.maximum(PRIOR_SIGMA, 1e-5), np.full(2, TILT_SIGMA)])
     prior = gaussian_prior(start, jnp.diag(jnp.asarray(sigma**2)))
-    return eqx.tree_at(lambda c: c.prior, chain, prior), guess
+    lidar = jnp.minimum(100 * chain.lidar.information, 1e10)
+    # positions of a world that is nearly level, so that the tilt is small and the model all but linear
+    noise = 0.002 * np.random.default_rng(1).normal(size=(ROWS, 3))
+    measured = guess.T_world_imu.wxyz_xyz.at[:, 4:].add(noise)
+    places = lambda c: (c.prior, c.lidar.information, c.lidar.T_world_imu.wxyz_xyz)  # noqa: E731
+    return eqx.tree_at(places, chain, (prior, lidar, measured)), guess
 
 
 @cache
@@ -98,7 +104,7 @@ def test_the_tilt_is_found_from_samples_that_feel_it():
     moved = eqx.tree_at(lambda c: (c.imu, c.prior.tilt), chain, (links, TRUE_TILT))
     found = quick_jit(lambda c, g: smooth(c, g, max_iterations=20, tolerance=jnp.array(1e-6)))(moved, guess)
     assert found.status == CONVERGED
-    np.testing.assert_allclose(found.tilt, TRUE_TILT + before, atol=3e-4)
+    np.testing.assert_allclose(found.tilt, TRUE_TILT + before, atol=1e-5)
 
 
 def test_a_window_that_forgot_knows_as_much_as_the_whole_chain():
@@ -109,7 +115,8 @@ def test_a_window_that_forgot_knows_as_much_as_the_whole_chain():
     expected = found.joint_covariance(jnp.int32(ROWS - 1))
     sigma = np.sqrt(np.diagonal(expected))
     assert (sigma[15:] < 0.9 * TILT_SIGMA).all()
-    np.testing.assert_allclose((result.tilt - found.tilt) / sigma[15:], 0, atol=1e-4)
+    # what was forgotten stays linearised where it was: an error of second order
+    np.testing.assert_allclose((result.tilt - found.tilt) / sigma[15:], 0, atol=1e-3)
     np.testing.assert_allclose(stated / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-4)
     assert float(log_evidence(window.chain, result)) == pytest.approx(evidence, rel=1e-6)
 
@@ -124,7 +131,9 @@ def test_without_an_error_of_the_map_the_latest_error_is_the_windows_own():
 
 def test_another_world_turns_the_tilt():
     window = along()[-1][0]
-    window = eqx.tree_at(lambda w: w.tilt, window, jnp.array([0.05, -0.02]))
+    # away from the minimum, where no gradient is zero
+    apart = window.states.retract(jnp.asarray(np.random.default_rng(0).normal(0, 0.1, (CAPACITY, 15))))
+    window = eqx.tree_at(lambda w: (w.tilt, w.states), window, (jnp.array([0.05, -0.02]), apart))
     T_new_old = jaxlie.SE3.from_rotation_and_translation(
         jaxlie.SO3.from_z_radians(jnp.asarray(2.0)), jnp.array([30.0, -20.0, 5.0])
     )
