@@ -48,6 +48,7 @@ class Echo:
 class Nav(eqx.Module):
     T_world_imu: jaxlie.SE3
     velocity: Float[Array, "3"]
+    gravity: Float[Array, "3"]
 
 
 class Seen(eqx.Module):
@@ -102,7 +103,8 @@ def output_in_map(T_map_odom, T_odom_imu, number):
         Registered(se3(T @ LIFT)), table, T_map_odom[:3, :3] @ origin + T_map_odom[:3, 3],
         (rows @ T_map_odom[:3, :3].T).astype(np.float32),
     )  # fmt: skip
-    return Nav(se3(T), T_map_odom[:3, :3] @ np.array([1.0, 2.0, 0.5])), seen
+    turned = [T_map_odom[:3, :3] @ np.array(one) for one in ([1.0, 2.0, 0.5], [0.1, 0.2, -9.8])]
+    return Nav(se3(T), *turned), seen
 
 
 def fed_back(until):
@@ -162,6 +164,7 @@ def test_the_odometry_does_not_jump():
     np.testing.assert_allclose(found, T_map_odom, atol=1e-12)
     np.testing.assert_allclose(nav.T_world_imu.as_matrix(), T, atol=1e-12)
     np.testing.assert_allclose(nav.velocity, [1.0, 2.0, 0.5], atol=1e-12)
+    np.testing.assert_allclose(nav.gravity, [0.1, 0.2, -9.8], atol=1e-12)
     np.testing.assert_allclose(seen.registration.T_world_lidar.as_matrix(), T @ LIFT, atol=1e-12)
     np.testing.assert_allclose(seen.origin, [3.0, 1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(seen.points, np.arange(6.0).reshape(2, 3), atol=1e-5)
