@@ -87,6 +87,8 @@ from .tuning.optimise import parameter_covariance as parameter_covariance
 from .tuning.optimise import stationary as stationary
 from .tuning.parameters import free_parameters as free_parameters
 from .tuning.recording import Recording as Recording
+from .tuning.session import Iterate as Iterate
+from .tuning.train import Epoch as Epoch
 from .tuning.train import Schedule as Schedule
 from .tuning.train import Trained as Trained
 from .tuning.train import train as train

@@ -69,7 +69,7 @@ def _draw(path: Path, found: Trained) -> None:
     losses = {"training": np.array([epoch.training for epoch in found.epochs])}
     if found.epochs[0].validation is not None:
         losses["validation"] = np.array([epoch.validation for epoch in found.epochs], float)
-    plot_tuning(path, losses, {}, {}, found.best)
+    plot_tuning(path, losses, {}, {}, found.best, "epoch, from 0")
 
 
 def _table(found: Trained) -> str:

@@ -22,6 +22,7 @@ from lio_jax.tuning.session import HISTORY, Iterate, Session
 from lio_jax.tuning.tune import (
     Optimiser,
     Tuned,
+    check_counts,
     given_tree,
     in_own_units,
     optimiser_for,
@@ -61,7 +62,7 @@ def tune(
         UsageError: unknown parameters or objective, or truth is needed and missing.
         LioJaxError: a recording cannot be read, or the objective is not finite at the start.
     """
-    _check(options, data, gt)
+    check_counts(options.iterations, options.patience)
     base = resolve_settings(options.recipe, options.assignments, options.params_from)
     patterns = patterns_in(options.params)
     sequences, judges, truth = recordings_of(data, validate, gt, base)
@@ -116,16 +117,6 @@ def recordings_of(
     sequences = [open_sequence(path, settings.run.data) for path in data]
     judges = [open_sequence(path, settings.run.data) for path in validate]
     return sequences, judges, None if gt is None else truth_of(sequences[0], gt)
-
-
-def _check(options: TuneOptions, data: tuple[Path, ...], gt: Path | None) -> None:
-    for name in ("iterations", "patience"):
-        if getattr(options, name) < 1:
-            raise UsageError(f"--{name} must be 1 or more, not {getattr(options, name)}.")
-    if options.start < 0 or (options.scans is not None and options.scans < 2):
-        raise UsageError(
-            f"--start must be 0 or more and --scans 2 or more, not {options.start} and {options.scans}."
-        )
 
 
 def prepare_folder(out: Path, history: str, overwrite: bool) -> None:

@@ -126,6 +126,8 @@ def problem_of(
     """
     if not recordings:
         raise UsageError("no recording was given to learn from.")
+    if start < 0 or (count is not None and count < 2):
+        raise UsageError(f"--start must be 0 or more and --scans 2 or more, not {start} and {count}.")
     if segment is not None and segment < SHORTEST_SEGMENT:
         raise UsageError(
             f"--segment must be {SHORTEST_SEGMENT} scans or more, not {segment}: a shorter one shows the "

@@ -82,6 +82,8 @@ class Session:
             LioJaxError: the history is that of other parameters.
         """
         self._path = None if folder is None else folder / HISTORY
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
         self._free, self._loss = free, loss
         self._training, self._validation = training, validation
         self._likelihood, self._patience, self._observer = likelihood, patience, observer

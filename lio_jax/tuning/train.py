@@ -108,8 +108,8 @@ def train(
         truth: in place of that of the recordings.
         segment: number of scans of a piece, each of which starts on its own; None: whole recordings.
         schedule: of the steps.
-        out: folder for ``training.npz``, from which the same call goes on after a kill; None: nothing is
-            written.
+        out: folder for ``training.npz``, made where there is none, from which the same call goes on after
+            a kill; None: nothing is written.
         observer: called after every epoch.
 
     Raises:
@@ -140,6 +140,8 @@ class TrainingSession:
         """
         self._problem, self._schedule = problem, schedule
         self._path = None if out is None else out / TRAINING
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
         first = problem.first()
         self._x, self._moments, self._best_x = first, Moments.none(len(first)), first
         self._losses: list[float] = []

@@ -77,8 +77,8 @@ def tune(
         iterations: largest number of evaluations.
         patience: number of evaluations without a better one after which the tuning ends.
         seed: of the segments that adam draws.
-        out: folder for ``history.json``, from which the same call goes on after a kill; None: nothing is
-            written.
+        out: folder for ``history.json``, made where there is none, from which the same call goes on after
+            a kill; None: nothing is written.
         observer: called after every evaluation.
 
     Raises:
@@ -86,11 +86,23 @@ def tune(
             objective.
         LioJaxError: the objective is not finite at the start, or does not depend on the parameters.
     """
+    check_counts(iterations, patience)
     problem = problem_of(recordings, patterns, objective, settings, validate, truth, start, count, segment)
     chosen = optimiser_for(problem, optimiser)
     session = session_of(problem, out, patience, observer)
     session.run(chosen, problem.first(), problem.bounds(), iterations, seed)
     return tuned_by(problem, session)
+
+
+def check_counts(iterations: int, patience: int) -> None:
+    """Refuse a tuning without evaluations.
+
+    Raises:
+        UsageError: a number is not positive.
+    """
+    for name, count in (("iterations", iterations), ("patience", patience)):
+        if count < 1:
+            raise UsageError(f"--{name} must be 1 or more, not {count}.")
 
 
 def optimiser_for(problem: Problem, optimiser: Optimiser) -> str:

@@ -195,8 +195,9 @@ def plot_tuning(
     parameters: Mapping[str, NDArray[np.float64]],
     intervals: Mapping[str, tuple[float, float]],
     best: int,
+    counted: str = "evaluation",
 ) -> None:
-    """Draw losses and parameters over the evaluations, with one panel for each parameter.
+    """Draw losses and parameters over the evaluations or epochs, with one panel for each parameter.
 
     Args:
         path_png: file to write, complete or not at all.
@@ -204,6 +205,7 @@ def plot_tuning(
         parameters: (n,) values by name; positive ones are drawn on a log scale.
         intervals: 95 % interval of the best value by name, where known.
         best: index of the evaluation that was taken.
+        counted: what the values are of; the first one is number 0.
     """
     panels = 1 + len(parameters)
     columns = min(3, panels)
@@ -225,7 +227,7 @@ def plot_tuning(
         panel.set_title(name, fontsize="medium")
     for panel in axes[:panels]:
         panel.axvline(best, color="k", linewidth=0.8, linestyle=":")
-        panel.set_xlabel("evaluation")
+        panel.set_xlabel(counted)
         panel.grid(True, which="both", alpha=0.25)
     for panel in axes[panels:]:
         panel.set_axis_off()

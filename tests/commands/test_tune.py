@@ -3,11 +3,21 @@
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
+from lio_jax import (
+    Schedule,
+    Settings,
+    UsageError,
+    open_sequence,
+    train,
+    tune,
+    with_overrides,
+)
 from lio_jax.cli import main
 from lio_jax.commands.run import resolve_settings
 from lio_jax.data.native_writer import write_native
@@ -76,6 +86,44 @@ def test_a_tuning_leaves_settings_history_and_a_picture(recordings, tmp_path, ca
     assert main([*words, "--iterations", "4"]) == 0
     assert "continuing after 3 evaluations" in capsys.readouterr().err
     assert len(json.loads((out / "history.json").read_text())["iterates"]) == 4
+
+
+def test_tune_from_python_is_that_of_the_command(recordings, tmp_path):
+    words = ["tune", recordings[0], *PARAMS, "--out", str(tmp_path / "command"), *SMALL]
+    assert main([*words, "--iterations", "2"]) == 0
+    settings = with_overrides(Settings(), SMALL[1:])
+    sequences = [open_sequence(Path(recordings[0]))]
+    found = tune(sequences, PARAMS[1].split(","), settings=settings, iterations=2, out=tmp_path / "a" / "b")
+    written = json.loads((tmp_path / "command" / "history.json").read_text())
+    assert json.loads((tmp_path / "a" / "b" / "history.json").read_text()) == written
+    assert found.settings == resolve_settings(str(tmp_path / "command" / "tuned.yaml"), ())
+    assert found.values["imu.gyro_noise"] == pytest.approx(found.settings.values["imu"]["gyro_noise"])
+    low, high = found.intervals["lidar.range_sigma"]
+    assert low < found.values["lidar.range_sigma"] < high
+    assert found.best in found.history
+    with pytest.raises(UsageError, match="--iterations must be 1 or more"):
+        tune(sequences, ["imu.*"], settings=settings, iterations=0)
+
+
+@pytest.mark.long
+def test_train_from_python_lowers_the_loss(recordings, tmp_path):
+    settings = with_overrides(Settings(), [*SMALL[1:], "params.lidar.range_sigma=0.1"])
+    schedule = Schedule(batch=1, epochs=3, rate=0.3)
+    judges = [open_sequence(Path(recordings[1]))]
+    found = train(
+        [open_sequence(Path(recordings[0]))],
+        ["lidar.range_sigma"],
+        "ranges",
+        settings,
+        judges,
+        segment=20,
+        schedule=schedule,
+        out=tmp_path / "a" / "b",
+    )
+    losses = [epoch.validation for epoch in found.epochs]
+    assert losses == sorted(losses, reverse=True)
+    assert found.best == 2
+    assert 0.03 < found.settings.values["lidar"]["range_sigma"] < 0.08
 
 
 @pytest.mark.parametrize("theirs", [None, LIO_SAM_ROS1], ids=["ours", "theirs"])
