@@ -30,7 +30,7 @@ class UnpredictedMatch(eqx.Module):
 
     plane_points: Scalar = leaf(6.0, above=0)
     """Without inertial samples, a voxel with fewer points than this counts as a single scan line, which
-    defines no plane. Where less than a third of the scan's points would be matched,
+    defines no plane. Where less than half of the scan's points would be matched,
     ``params.map.min_points`` points are enough."""
 
 

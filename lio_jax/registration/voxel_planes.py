@@ -371,7 +371,7 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
 
     Each of the 64 cells of a voxel holds one point, and a straight line along a face crosses four to seven of
     them. Through points on a line goes a plane in any direction, and noise or motion along the beam selects
-    the one that contains the beam: a turn of the sensor then seems to be none. Where less than a third of the
+    the one that contains the beam: a turn of the sensor then seems to be none. Where less than half of the
     points would be matched, ``map_params.min_points`` are enough."""
 
     def together(self, points: Float[Array, "k 3"]) -> tuple[Float[Array, "k 3"], Bool[Array, " k"]]:
@@ -388,7 +388,7 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
             return self._by_width(found(self.map_params))
         needed = jnp.maximum(self.map_params.min_points, self.plane_points)
         on_planes = found(replace(self.map_params, min_points=needed))
-        enough = jnp.sum(on_planes.used) >= _WIDE_SHARE * jnp.sum(self.mask)
+        enough = 2 * jnp.sum(on_planes.used) >= jnp.sum(self.mask)
         matches = jax.lax.cond(enough, lambda: on_planes, lambda: found(self.map_params))
         return self._by_width(matches)
 
