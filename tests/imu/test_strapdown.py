@@ -229,8 +229,10 @@ def test_gradients_are_finite_differences(reverse, imu: ImuBatch, still: bool) -
 
 
 def along(directions, x, imu):
-    """Return what a propagation leaves and its derivatives along directions of 14 numbers: of the velocity, of
-    the rate where nothing is measured, of the start's variances and of the noise."""
+    """Return a propagated covariance and its derivatives along directions of 14 numbers.
+
+    The numbers change the velocity, the rate where nothing is measured, the first variances and the noise.
+    """
 
     def left(x):
         begun = state(ORIGIN, 1e-4 * np.eye(DOF))
