@@ -19,7 +19,7 @@ from lio_jax.run.run import settings_for
 from lio_jax.settings.settings import Settings, recipe_of, recipe_settings
 from lio_jax.tuning.corrected import CorrectedLoss, free_of_back_end, names_back_end
 from lio_jax.tuning.evaluated import Evaluated
-from lio_jax.tuning.objectives import Named, Objective, nothing_counts, nothing_depends, objective_named
+from lio_jax.tuning.objectives import Named, Objective, as_named, nothing_counts, nothing_depends
 from lio_jax.tuning.parameters import ParameterVector, free_parameters
 from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.reverse import TotalGradient, checkpointed_gradient
@@ -85,7 +85,7 @@ def gradient(
     if mode not in ("auto", "forward", "reverse"):
         raise UsageError(f"mode '{mode}' is not known; there are: auto, forward, reverse.")
     resolved, _ = settings_for(sequence, settings or recipe_settings("default"))
-    named = objective_named(objective) if isinstance(objective, str) else Named(objective, False, False)
+    named = as_named(objective)
     if names_back_end(patterns, resolved):
         free = free_of_back_end(resolved, patterns, named)
         recording = Recording(sequence, resolved, start, count, truth, keep=False)
