@@ -232,7 +232,7 @@ def _update(now: dict[str, list[float]]) -> None:
     held = json.loads(BASELINE.read_text())
     for one in held["figures"]:
         for key, value in zip(("ratio", "error"), now.get(one["name"], []), strict=False):
-            one[key]["value"] = float(f"{value:.3g}")
+            one[key]["value"] = float(f"{value:.6g}")
     BASELINE.write_text(json.dumps(held, indent=2) + "\n")
 
 
