@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test test-all test-long lint bench fuzz settings docs docs-notebooks figures clean
+.PHONY: demo test test-all test-long lint bench bench-check fuzz settings docs docs-notebooks figures clean
 
 demo: $(VENV)/.installed
 	$(BIN)/lio-jax demo --out out/demo --overwrite
@@ -29,6 +29,10 @@ lint: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-bench
 	$(BIN)/python experiments/bench/lidar_vs_peers.py
+
+# Short benchmarks beside experiments/bench/baseline.json: fails if one has become slower or less accurate.
+bench-check: $(VENV)/.installed-bench
+	$(BIN)/python experiments/bench/bench_check.py
 
 # Damaged files through the command line: N of them, the same ones for the same SEED. Failures stay in out/fuzz/kept.
 N ?= 1000

@@ -26,7 +26,6 @@ from lio_jax.tuning.tune import (
     given_tree,
     in_own_units,
     optimiser_for,
-    session_of,
     tuned_by,
 )
 
@@ -81,7 +80,7 @@ def tune(
     for note in problem.notes:
         say(f"note: {note}")
     prepare_folder(out, HISTORY, options.overwrite)
-    session = session_of(problem, out, options.patience, lambda iterate: _report(problem.free, iterate))
+    session = Session(problem, out, options.patience, lambda iterate: _report(problem.free, iterate))
     if session.history:
         say(f"note: continuing after {len(session.history)} evaluations in {out / HISTORY}.")
     with _interruptible(session):
@@ -144,7 +143,6 @@ def _interruptible(session: Session) -> Iterator[None]:
 
 
 def _report(free: ParameterVector, iterate: Iterate) -> None:
-    shown = in_own_units(free, np.asarray(iterate.x))
     shown = in_own_units(free, np.asarray(iterate.x))
     values = "  ".join(f"{name.split('.', 1)[1]} {value:.4g}" for name, value in shown.items())
     judged = "" if iterate.validation is None else f"  validation {iterate.validation:.6g}"

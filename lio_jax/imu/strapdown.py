@@ -161,11 +161,11 @@ def propagate_sweep(
     moved = dataclasses.replace(nav, T_world_imu=last, velocity=path.velocity[-1])
 
     motion = _SampledMotion(intervals, shift, path.rate, path.accel, increments)
-    model = _ImuModel(nav.gyro_bias, nav.accel_bias, nav.time_offset, params)
+    model = _ImuModel(nav.gyro_bias, nav.accel_bias, nav.time_offset, params, unmeasured)
     times = start, end, sweep_start
     held = jax.lax.stop_gradient(model)
     known = _effects_of(*jax.lax.stop_gradient((motion, params, *times)))
-    effects = with_derivative_of(known, _linear_effects, model, held, imu, times, unmeasured)
+    effects = with_derivative_of(known, _linear_effects, model, held, imu, times)
 
     shown = still_to_show(start, sweep_start, end)
     transition = _transition(nav, increments, path.gravity, effects.by_bias, effects.by_offset, shown)
@@ -193,6 +193,8 @@ class _ImuModel(NamedTuple):
     accel_bias: Float[Array, "3"]
     time_offset: Float[Array, ""]
     noise: ImuParams
+    unmeasured: tuple[Float[Array, "3"], Float[Array, "3"]]
+    """Rate and weightless force where nothing is measured, rad/s and m/s^2, IMU frame."""
 
 
 class _Effects(NamedTuple):
@@ -227,18 +229,17 @@ def _effects_of(
     )
 
 
-def _linear_effects(
-    model: _ImuModel, held: _ImuModel, imu: ImuBatch, times: tuple, unmeasured: tuple[Array, Array]
-) -> _Effects:
+def _linear_effects(model: _ImuModel, held: _ImuModel, imu: ImuBatch, times: tuple) -> _Effects:
     """Return the effects as a linear function of the model around the same values.
 
     The slope by each of its few numbers is worked out once, so the cost grows little with the number of
-    tangents.
+    tangents. This holds as long as ``model`` alone has tangents: any other argument with tangents would make
+    every slope a second derivative along each of them.
     """
     at, numbers = ravel_pytree(held)
 
     def effects(x: Array) -> _Effects:
-        gyro_bias, accel_bias, time_offset, noise = numbers(x)
+        gyro_bias, accel_bias, time_offset, noise, unmeasured = numbers(x)
         intervals, shift = _intervals_and_shift(imu, time_offset, *times[:2])
         rate, accel = intervals.without_bias(gyro_bias, accel_bias, unmeasured)
         increments = accumulate(intervals.duration, rate, accel)

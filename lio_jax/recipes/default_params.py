@@ -25,7 +25,16 @@ class InertialMatch(eqx.Module):
     third of the matches, the width is halved, three times at most, and then zero."""
 
 
-class VoxelMatch(GaussNewtonMatch, RobustFilterMatch, ThinnedMatch, InertialMatch):
+class UnpredictedMatch(eqx.Module):
+    """What differs in the match where nothing but the last velocity predicts the pose."""
+
+    plane_points: Scalar = leaf(6.0, above=0)
+    """Without inertial samples, a voxel with fewer points than this counts as a single scan line, which
+    defines no plane. Where less than half of the scan's points would be matched,
+    ``params.map.min_points`` points are enough."""
+
+
+class VoxelMatch(GaussNewtonMatch, RobustFilterMatch, ThinnedMatch, InertialMatch, UnpredictedMatch):
     """A match with the planes of a voxel map, by Gauss-Newton or in the filter."""
 
 

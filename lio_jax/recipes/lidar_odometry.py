@@ -128,6 +128,7 @@ def step(
             prediction_error=state.prediction_error,
             map_params=params.map,
             lidar=params.lidar,
+            plane_points=params.registration.plane_points,
         )
         result, matches = gauss_newton_with_matches(match, config.registration.max_iterations)
         lost = (result.status == LOST) & ~first

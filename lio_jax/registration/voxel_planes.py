@@ -366,6 +366,13 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
     least_width: Float[Array, ""] | float = 0.0
     """Standard deviation across a voxel below which its points define no plane, m; 0: scan lines count as
     planes. They should not where inertial samples predict the pose. It is less where few voxels are wide."""
+    plane_points: Float[Array, ""] | None = None
+    """Number of points that a voxel needs to define a plane, where it is more than ``map_params.min_points``.
+
+    Each of the 64 cells of a voxel holds one point, and a straight line along a face crosses four to seven of
+    them. Through points on a line goes a plane in any direction, and noise or motion along the beam selects
+    the one that contains the beam: a turn of the sensor then seems to be none. Where less than half of the
+    points would be matched, ``map_params.min_points`` are enough."""
 
     def together(self, points: Float[Array, "k 3"]) -> tuple[Float[Array, "k 3"], Bool[Array, " k"]]:
         return points, self.mask
@@ -374,8 +381,16 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
         return self._by_width(no_matches(self.mask, self.map.moments.dtype))
 
     def associate(self, points: Float[Array, "k 3"], T_world_lidar: jaxlie.SE3) -> Matches:
-        found = associate(self.map, points, self.mask, T_world_lidar, self.frame(), self.map_params)
-        return self._by_width(found)
+        def found(map_params: VoxelMapParams) -> Matches:
+            return associate(self.map, points, self.mask, T_world_lidar, self.frame(), map_params)
+
+        if self.plane_points is None:
+            return self._by_width(found(self.map_params))
+        needed = jnp.maximum(self.map_params.min_points, self.plane_points)
+        on_planes = found(replace(self.map_params, min_points=needed))
+        enough = 2 * jnp.sum(on_planes.used) >= jnp.sum(self.mask)
+        matches = jax.lax.cond(enough, lambda: on_planes, lambda: found(self.map_params))
+        return self._by_width(matches)
 
     def _by_width(self, found: Matches) -> Matches:
         least = jnp.asarray(self.least_width**2, found.variances.dtype)

@@ -19,7 +19,7 @@ from lio_jax.run.run import settings_for
 from lio_jax.settings.settings import Settings, recipe_of, recipe_settings
 from lio_jax.tuning.corrected import CorrectedLoss, free_of_back_end, names_back_end
 from lio_jax.tuning.evaluated import Evaluated
-from lio_jax.tuning.objectives import Named, Objective, nothing_counts, nothing_depends, objective_named
+from lio_jax.tuning.objectives import Named, Objective, as_named, nothing_counts, nothing_depends
 from lio_jax.tuning.parameters import ParameterVector, free_parameters
 from lio_jax.tuning.recording import Recording
 from lio_jax.tuning.reverse import TotalGradient, checkpointed_gradient
@@ -71,8 +71,9 @@ def gradient(
         start: first scan.
         count: number of scans; None: to the end.
         mode: forward: constant memory, time grows with the number of parameters; reverse: time does not grow
-            with it, memory grows with the number of scans, all of which are kept; auto: reverse where there
-            are more than 32 parameters.
+            with it, memory grows with the number of scans, all of which are kept, and the programs take about
+            ten times as long to compile; auto: reverse where there are more than 32 parameters. A parameter
+            with n numbers, such as a network's weights, counts n times.
         through_map: whether the map moves with the poses at which its points were inserted, which costs time
             and memory: per parameter 40 bytes for each slot of a voxel map, and 324 bytes for each block of a
             map of points, of which loam and lio_sam have two; None: where :func:`wants_map` says so.
@@ -85,7 +86,7 @@ def gradient(
     if mode not in ("auto", "forward", "reverse"):
         raise UsageError(f"mode '{mode}' is not known; there are: auto, forward, reverse.")
     resolved, _ = settings_for(sequence, settings or recipe_settings("default"))
-    named = objective_named(objective) if isinstance(objective, str) else Named(objective, False, False)
+    named = as_named(objective)
     if names_back_end(patterns, resolved):
         free = free_of_back_end(resolved, patterns, named)
         recording = Recording(sequence, resolved, start, count, truth, keep=False)
@@ -129,7 +130,12 @@ def wants_map(named: Named, free: ParameterVector) -> bool:
 
 
 _MOST_FORWARD = 32
-"""Number of parameters up to which forward mode is taken."""
+"""Number of parameters up to which forward mode is taken, whatever they are.
+
+The cost of a tangent hardly depends on its parameter: in the default recipe the weights of a network behind
+the range noise cost as much as the noise densities. From about 12 numbers on, reverse mode takes less time a
+scan in small scans, and from about 30 on in large ones. Forward mode compiles in a tenth of the time.
+"""
 
 
 class Loss:

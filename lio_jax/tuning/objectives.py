@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Protocol
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int32
 
@@ -354,6 +355,8 @@ class Named:
     needs_truth: bool
     likelihood: bool
     """A mean negative log-likelihood per scan: its scores give the parameters' uncertainty."""
+    name: str = ""
+    """Words that tell it from other objectives, the same in every process."""
 
 
 OPENING = 10
@@ -395,7 +398,8 @@ def objective_named(text: str) -> Named:
     Raises:
         UsageError: a name is not known (lists those there are), or a weight is no number.
     """
-    terms = SHORT.get(text, text).split("+")
+    written = SHORT.get(text, text).replace(" ", "")
+    terms = written.split("+")
     parts, weights = [], []
     for term in terms:
         weight, star, name = term.rpartition("*")
@@ -409,9 +413,35 @@ def objective_named(text: str) -> Named:
             raise UsageError(f"objective '{term}': '{weight}' is no number to weigh {name} with.") from None
         parts.append(_SINGLE[name.strip()])
     if len(parts) == 1 and weights == [1.0]:
-        return parts[0]
+        return replace(parts[0], name=written)
     return Named(
         WeightedSum(tuple(part.objective for part in parts), tuple(weights)),
         any(part.needs_truth for part in parts),
         all(part.likelihood for part in parts) and set(weights) == {1.0},
+        written,
     )
+
+
+def as_named(objective: str | Objective) -> Named:
+    """Return an objective that is given by name or is one's own, which needs no truth and has no scores.
+
+    Raises:
+        UsageError: see :func:`objective_named`.
+    """
+    if isinstance(objective, str):
+        return objective_named(objective)
+    return Named(objective, False, False, _in_words(objective))
+
+
+def _in_words(part: Any) -> str:
+    """Return the classes, functions and numbers of which an objective consists, without addresses."""
+    if isinstance(part, tuple | list):
+        return f"({', '.join(map(_in_words, part))})"
+    if is_dataclass(part) and not isinstance(part, type):
+        inside = ", ".join(_in_words(getattr(part, field.name)) for field in fields(part))
+        return f"{type(part).__qualname__}({inside})"
+    if isinstance(part, bool | int | float | str) or part is None:
+        return repr(part)
+    if isinstance(part, jax.Array | np.ndarray):
+        return str(np.asarray(part).tolist())
+    return str(getattr(part, "__qualname__", type(part).__qualname__))

@@ -216,6 +216,11 @@ class Moments(NamedTuple):
         mean = 0.9 * self.mean + 0.1 * gradient
         return Moments(mean, 0.99 * self.square + 0.01 * gradient**2, self.steps + 1)
 
+    def step(self, x: Vector, gradient: Vector, rate: float, bounds: "Bounds") -> tuple["Moments", Vector]:
+        """Return the moments after one more gradient, and where the step of length ``rate`` leads."""
+        moments = self.with_gradient(gradient)
+        return moments, bounds.clip(x - rate * moments.direction())
+
     def direction(self) -> Vector:
         """Return the direction to descend against: a component is near 1 where its gradients agree."""
         mean = self.mean / (1 - 0.9**self.steps)
@@ -224,8 +229,12 @@ class Moments(NamedTuple):
 
 
 def adam(segments: Iterator[Evaluate], x: Vector, bounds: Bounds, iterations: int, rate: float = 0.1) -> None:
-    """Stochastic steps over random segments (Kingma & Ba 2015), the rate falling to a tenth at the end."""
+    """Stochastic steps over random segments (Kingma & Ba 2015), the rate falling to a tenth at the end.
+
+    It serves a tuning, which judges and writes down every evaluation. A training takes the same steps over
+    batches and epochs (:mod:`lio_jax.tuning.train`).
+    """
     moments = Moments.none(len(x))
     for iteration in range(1, iterations + 1):
-        moments = moments.with_gradient(next(segments)(x).gradient)
-        x = bounds.clip(x - rate * 0.1 ** (iteration / iterations) * moments.direction())
+        gradient = next(segments)(x).gradient
+        moments, x = moments.step(x, gradient, rate * 0.1 ** (iteration / iterations), bounds)

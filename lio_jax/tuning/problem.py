@@ -16,7 +16,7 @@ from lio_jax.run.run import settings_for
 from lio_jax.settings.settings import Settings
 from lio_jax.tuning.corrected import CorrectedLoss, free_of_back_end, names_back_end
 from lio_jax.tuning.gradient import Loss, Mode, wants_map
-from lio_jax.tuning.objectives import Named, Objective, objective_named
+from lio_jax.tuning.objectives import Named, Objective, as_named
 from lio_jax.tuning.optimise import Bounds
 from lio_jax.tuning.parameters import ParameterVector, free_parameters
 from lio_jax.tuning.recording import Recording
@@ -135,7 +135,7 @@ def problem_of(
         )
     given = settings if settings is not None else Settings()
     corrected = names_back_end(patterns, given)
-    named = _named(objective, corrected)
+    named = as_named(objective if objective is not None else "ate" if corrected else "noise")
 
     def free_in(settings: Settings) -> ParameterVector:
         if corrected:
@@ -175,12 +175,6 @@ def problem_of(
         tuple(validation),
         tuple(notes),
     )
-
-
-def _named(objective: str | Objective | None, corrected: bool) -> Named:
-    if objective is None:
-        objective = "ate" if corrected else "noise"
-    return objective_named(objective) if isinstance(objective, str) else Named(objective, False, False)
 
 
 def _check_truth(sequence: Sequence, truth: Trajectory | None, named: Named) -> None:

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import atomic_path
-from lio_jax.tuning.corrected import CorrectedLoss
-from lio_jax.tuning.evaluated import Evaluated
-from lio_jax.tuning.gradient import Loss
+from lio_jax.tuning.evaluated import Evaluated, validation_loss
 from lio_jax.tuning.objectives import nothing_counts, nothing_depends
 from lio_jax.tuning.optimise import Bounds, adam, fisher_scoring, lbfgsb, parameter_covariance, stationary
 from lio_jax.tuning.parameters import ParameterVector
+from lio_jax.tuning.problem import Problem
 from lio_jax.tuning.recording import Recording
 
 HISTORY = "history.json"
@@ -57,24 +56,16 @@ class Session:
 
     def __init__(
         self,
+        problem: Problem,
         folder: Path | None,
-        free: ParameterVector,
-        loss: Loss | CorrectedLoss,
-        training: Listing[Recording],
-        validation: Listing[Recording],
-        likelihood: bool,
         patience: int,
         observer: Callable[[Iterate], None] = lambda iterate: None,
     ) -> None:
         """Take up the history that lies in the folder.
 
         Args:
+            problem: the loss of the parameters and its recordings.
             folder: gets ``history.json`` after every evaluation; None: nothing is written.
-            free: parameters that are tuned.
-            loss: their loss.
-            training: recordings to tune on.
-            validation: recordings to judge by; may be empty.
-            likelihood: the loss is a mean negative log-likelihood.
             patience: evaluations without a better one before the tuning ends.
             observer: called after every evaluation.
 
@@ -84,11 +75,11 @@ class Session:
         self._path = None if folder is None else folder / HISTORY
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
-        self._free, self._loss = free, loss
-        self._training, self._validation = training, validation
-        self._likelihood, self._patience, self._observer = likelihood, patience, observer
+        self._problem, self._patience, self._observer = problem, patience, observer
         self._unit: NDArray[np.float64] | None = None
-        self.history: list[Iterate] = _read(self._path, free) if self._path and self._path.exists() else []
+        self.history: list[Iterate] = []
+        if self._path is not None and self._path.exists():
+            self.history = _read(self._path, problem.free)
 
     @property
     def best(self) -> Iterate:
@@ -138,24 +129,20 @@ class Session:
             EarlyStop: it has not fallen for long.
             LioJaxError: the very first value is not finite, or does not depend on the parameters.
         """
-        result = self._loss(x, recordings or self._training)
+        problem = self._problem
+        result = problem.loss(x, recordings or problem.training)
         if not self.history and not math.isfinite(result.value):
             raise LioJaxError(
                 "the objective is not finite at the start; check the parameters with lio-jax run first."
             )
-        if self._likelihood and not self.history and result.scores is not None and not result.scores.any():
+        if problem.scored and not self.history and result.scores is not None and not result.scores.any():
             raise nothing_counts(result.scans)
         if not self.history and not result.gradient.any():
-            raise nothing_depends(self._free.names)
+            raise nothing_depends(problem.free.names)
         sigma = None
-        if self._likelihood:
+        if problem.scored:
             variance = np.diag(parameter_covariance(result))
             sigma = tuple(np.sqrt(np.maximum(variance, 0.0)).tolist())
-        validation = None
-        if self._validation:
-            rows = np.asarray(x)[None]
-            losses = [float(self._loss.values(rows, recording)[0]) for recording in self._validation]
-            validation = float(np.average(losses, weights=[len(recording) for recording in self._validation]))
         iterate = Iterate(
             tuple(np.asarray(x).tolist()),
             result.value,
@@ -163,7 +150,7 @@ class Session:
             sigma,
             result.unconverged,
             result.scans,
-            validation,
+            validation_loss(problem.loss, x, problem.validation),
         )
         self.history.append(iterate)
         self._write()
@@ -177,13 +164,17 @@ class Session:
         """Yield the loss over one recording after the other, drawn at random."""
         random = np.random.default_rng(seed)
         while True:
-            chosen = self._training[int(random.integers(len(self._training)))]
+            training = self._problem.training
+            chosen = training[int(random.integers(len(training)))]
             yield partial(self.evaluate, recordings=[chosen])
 
     def _write(self) -> None:
         if self._path is None:
             return
-        held: dict[str, Any] = {"names": self._free.names, "iterates": [asdict(one) for one in self.history]}
+        held: dict[str, Any] = {
+            "names": self._problem.free.names,
+            "iterates": [asdict(one) for one in self.history],
+        }
         with atomic_path(self._path) as aside:
             aside.write_text(json.dumps(held, indent=1) + "\n")
 

@@ -21,6 +21,7 @@ from lio_jax.core.files import atomic_path, read_arrays
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.settings.settings import Settings
+from lio_jax.tuning.evaluated import validation_loss
 from lio_jax.tuning.objectives import Objective, nothing_depends
 from lio_jax.tuning.optimise import Bounds, Moments
 from lio_jax.tuning.problem import Problem, problem_of
@@ -96,6 +97,8 @@ def train(
 ) -> Trained:
     """Train parameters of a recipe, such as a network's weights, on pieces of recordings.
 
+    For hundreds of numbers and many recordings. A few parameters are tuned by
+    :func:`lio_jax.tuning.tune.tune`, which finds their intervals, too.
     The gradients are by reverse mode. All pieces are kept in memory.
 
     Args:
@@ -136,7 +139,8 @@ class TrainingSession:
             out: folder for ``training.npz``; None: nothing is written.
 
         Raises:
-            UsageError: the training in the folder has other parameters, pieces or another order.
+            UsageError: the training in the folder has another objective, other parameters, recordings,
+                settings, pieces or another order.
         """
         self._problem, self._schedule = problem, schedule
         self._path = None if out is None else out / TRAINING
@@ -186,8 +190,7 @@ class TrainingSession:
         if math.isfinite(result.value) and np.isfinite(result.gradient).all():
             if not self._moments.steps and not result.gradient.any():
                 raise nothing_depends(self._problem.free.names)
-            self._moments = self._moments.with_gradient(result.gradient)
-            self._x = bounds.clip(self._x - rate * self._moments.direction())
+            self._moments, self._x = self._moments.step(self._x, result.gradient, rate, bounds)
             self._losses.append(result.value)
         else:
             self._skipped += 1
@@ -199,11 +202,7 @@ class TrainingSession:
                 f"no batch of epoch {len(self.epochs) + 1} has a finite loss and gradient; check the "
                 "parameters with lio-jax run, and make the rate smaller."
             )
-        validation = None
-        if judges := self._problem.validation:
-            rows = self._x[None]
-            losses = [float(self._problem.loss.values(rows, recording)[0]) for recording in judges]
-            validation = float(np.average(losses, weights=[len(recording) for recording in judges]))
+        validation = validation_loss(self._problem.loss, self._x, self._problem.validation)
         epoch = Epoch(float(np.mean(self._losses)), validation, self._skipped)
         self.epochs.append(epoch)
         if self.best == len(self.epochs) - 1:
@@ -213,10 +212,17 @@ class TrainingSession:
         observer(epoch)
 
     def _about(self) -> dict[str, Any]:
-        """Return what makes this training this one."""
+        """Return what makes this training this one, by the words in which another one is refused."""
+        problem = self._problem
         return {
-            "names": np.array(self._problem.free.names),
-            "pieces": np.array([len(piece) for piece in self._problem.training]),
+            "objective": np.array(problem.named.name),
+            "parameters": np.array(problem.free.names),
+            "start values": problem.first(),
+            "recipe": np.array(problem.settings.recipe),
+            "config": np.array(repr(problem.settings.config)),
+            "recordings": np.array([piece.name for piece in problem.training]),
+            "pieces": np.array([len(piece) for piece in problem.training]),
+            "recordings that judge": np.array([judge.name for judge in problem.validation], str),
             "batch": np.int64(self._schedule.batch),
             "seed": np.int64(self._schedule.seed),
         }
@@ -248,9 +254,10 @@ class TrainingSession:
                 f"{path}: is no training that can be continued ({error}); give --overwrite to begin anew."
             ) from None
         if other:
+            was = f" (it has {held['objective']})" if "objective" in other else ""
             raise UsageError(
-                f"{path}: is a training with other {', '.join(other)}; give another --out, or --overwrite to "
-                "begin anew."
+                f"{path}: is a training with other {', '.join(other)}{was}; give another --out, or "
+                "--overwrite to begin anew."
             )
         self._x, self._best_x = held["x"], held["best_x"]
         self._moments = Moments(held["mean"], held["square"], int(held["steps"]))

@@ -1,6 +1,5 @@
 """Tune parameters by gradient: the minimum of an objective over one's recordings."""
 
-import math
 from collections.abc import Callable
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass
@@ -61,6 +60,10 @@ def tune(
 ) -> Tuned:
     """Tune parameters by gradient.
 
+    For tens of parameters, whose values with their intervals are the result. Weights of learned parts are
+    trained by :func:`lio_jax.tuning.train.train`, which has no intervals and needs no evaluation of all
+    recordings.
+
     Args:
         recordings: to tune on.
         patterns: parameters by name or glob, such as ``imu.*_noise``.
@@ -73,7 +76,8 @@ def tune(
         count: number of scans of each; None: to the end.
         segment: cut the recordings into pieces of this many scans, each of which starts on its own.
         optimiser: auto takes scoring for likelihoods, stationary for extrinsics and corrections of points,
-            lbfgsb for the others; adam steps on segments.
+            lbfgsb for the others; adam steps along the gradient of one segment at a time, for recordings
+            that are too long to be evaluated whole at every step.
         iterations: largest number of evaluations.
         patience: number of evaluations without a better one after which the tuning ends.
         seed: of the segments that adam draws.
@@ -89,7 +93,7 @@ def tune(
     check_counts(iterations, patience)
     problem = problem_of(recordings, patterns, objective, settings, validate, truth, start, count, segment)
     chosen = optimiser_for(problem, optimiser)
-    session = session_of(problem, out, patience, observer)
+    session = Session(problem, out, patience, observer)
     session.run(chosen, problem.first(), problem.bounds(), iterations, seed)
     return tuned_by(problem, session)
 
@@ -127,14 +131,6 @@ def optimiser_for(problem: Problem, optimiser: Optimiser) -> str:
     return "scoring" if problem.scored else "stationary" if moved else "lbfgsb"
 
 
-def session_of(
-    problem: Problem, out: Path | None, patience: int, observer: Callable[[Iterate], None]
-) -> Session:
-    """Return the tuning of a problem, with the history that lies in the folder ``out``."""
-    about = problem.free, problem.loss, problem.training, problem.validation, problem.scored
-    return Session(out, *about, patience, observer)
-
-
 def tuned_by(problem: Problem, session: Session) -> Tuned:
     """Return what a tuning found so far; it has one evaluation at least."""
     best = session.best
@@ -151,23 +147,18 @@ def tuned_by(problem: Problem, session: Session) -> Tuned:
 
 def in_own_units(free: ParameterVector, x: NDArray[np.float64]) -> dict[str, float]:
     """Return the components of a vector in their own units: exp of those on a log scale."""
-    components = zip(free.names, free.declared, x.tolist(), strict=True)
-    return {
-        name: math.exp(value) if declared.tuned == "log" else value for name, declared, value in components
-    }
+    logarithmic = [declared.tuned == "log" for declared in free.declared]
+    # an interval of what is hardly observable may end where exp overflows
+    values = np.where(logarithmic, np.exp(np.clip(x, -700.0, 700.0)), x)
+    return dict(zip(free.names, values.tolist(), strict=True))
 
 
 def _intervals(free: ParameterVector, iterate: Iterate) -> dict[str, tuple[float, float]]:
     if iterate.sigma is None:
         return {}
-    intervals = {}
-    components = zip(free.names, free.declared, iterate.x, iterate.sigma, strict=True)
-    for name, declared, value, sigma in components:
-        ends = (value - 1.96 * sigma, value + 1.96 * sigma)
-        if declared.tuned == "log":
-            ends = (math.exp(max(ends[0], -700)), math.exp(min(ends[1], 700)))
-        intervals[name] = ends
-    return intervals
+    x, reach = np.asarray(iterate.x), 1.96 * np.asarray(iterate.sigma)
+    low, high = in_own_units(free, x - reach), in_own_units(free, x + reach)
+    return {name: (low[name], high[name]) for name in free.names}
 
 
 def given_tree(settings: Settings) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import pytest
 
 from lio_jax.core.error_state import ACCEL_BIAS, DOF, GYRO_BIAS, NavEstimate, local, retract
 from lio_jax.core.types import ImuBatch
-from lio_jax.imu.strapdown import path_along, propagate
+from lio_jax.imu.strapdown import path_along, propagate, propagate_sweep
 from tests.imu.motion import ideal_imu, nav_at, pose_matrix, quick_jit, velocity
 from tests.params import default_params
 
@@ -226,6 +226,44 @@ def test_gradients_are_finite_differences(reverse, imu: ImuBatch, still: bool) -
         2 * h
     )
     np.testing.assert_allclose(jnp.sum(by_gyro * along), difference, rtol=1e-6)
+
+
+def along(directions, x, imu):
+    """Return a propagated covariance and its derivatives along directions of 14 numbers.
+
+    The numbers change the velocity, the rate where nothing is measured, the first variances and the noise.
+    """
+
+    def left(x):
+        begun = state(ORIGIN, 1e-4 * np.eye(DOF))
+        nav = dataclasses.replace(begun.nav, velocity=begun.nav.velocity + x[:3])
+        params = dataclasses.replace(PARAMS, gyro_noise=PARAMS.gyro_noise * jnp.exp(x[13]))
+        begun = NavEstimate(nav, begun.covariance + jnp.diag(jnp.tile(x[6:12], 4)))
+        rate = jnp.asarray([0.3, -0.2, 0.5]) + x[3:6]
+        swept, _ = propagate_sweep(begun, imu, params, START, END, START, rate)
+        return swept.covariance
+
+    return jax.vmap(lambda one: jax.jvp(left, (x,), (one,)), out_axes=(None, 0))(directions)
+
+
+def test_without_samples_the_derivative_by_the_motion_is_a_finite_difference() -> None:
+    nothing, value = ideal_imu(np.zeros(0)), quick_jit(along)
+    directions, h = jnp.eye(14)[:6], 1e-6
+    _, slopes = value(directions, jnp.zeros(14), nothing)
+    for direction, slope in zip(directions, slopes, strict=True):
+        high, low = (value(directions, side * h * direction, nothing)[0] for side in (1, -1))
+        assert float(jnp.max(jnp.abs(slope))) > 1e-6
+        np.testing.assert_allclose(slope, (high - low) / (2 * h), rtol=1e-6, atol=1e-8)
+
+
+def test_tangents_share_the_slopes_of_the_samples(imu: ImuBatch) -> None:
+    """14 tangents need less than twice the operations of one."""
+
+    def operations(count: int) -> float:
+        lowered = jax.jit(along).lower(jnp.eye(14)[:count], jnp.zeros(14), imu)
+        return lowered.cost_analysis()["flops"]
+
+    assert operations(14) < 2 * operations(1)
 
 
 def test_it_runs_in_float32(imu: ImuBatch) -> None:

@@ -1,6 +1,7 @@
 """Optimisers and the session around them, on losses whose minimum is known."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,17 @@ from tests.params import default_params
 
 WIDE = Bounds(np.full(2, -20.0), np.full(2, 20.0))
 SAMPLES = np.random.default_rng(0).normal(0.0, [0.02, 3.0], (4000, 2))
+
+
+def problem(loss, scored=True):
+    """Return what a session sees of a problem with one recording."""
+    return SimpleNamespace(
+        free=free_parameters(default_params(), ["imu.gyro_noise", "lidar.range_sigma"]),
+        loss=loss,
+        training=(None,),
+        validation=(),
+        scored=scored,
+    )
 
 
 def noise_likelihood(x):
@@ -164,14 +176,14 @@ def test_the_best_of_a_session_that_looks_for_the_zero_has_the_smallest_gradient
         value = fair.value + 0.3 * (np.floor(20 * x[0]) % 2)
         return Evaluated(value, fair.gradient, None, 0, len(SAMPLES))
 
-    tuning = Session(tmp_path, FREE, loss, [None], [], False, 50)
+    tuning = Session(problem(loss, scored=False), tmp_path, 50)
     tuning.run("stationary", BEST + 2.0, WIDE, 40, 0)
     np.testing.assert_allclose(tuning.best.x, BEST, atol=0.02)
 
 
 def session(folder, loss=None, patience=50, observer=lambda iterate: None):
     evaluate = loss or (lambda x, recordings: noise_likelihood(x))
-    return Session(folder, FREE, evaluate, [None], [], True, patience, observer)
+    return Session(problem(evaluate), folder, patience, observer)
 
 
 def test_a_killed_tuning_goes_on_from_its_last_iterate(tmp_path):

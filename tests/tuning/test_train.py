@@ -8,6 +8,7 @@ import pytest
 
 from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.tuning.evaluated import Evaluated
+from lio_jax.tuning.objectives import MeanOverScans, as_named, objective_named
 from lio_jax.tuning.optimise import Bounds
 from lio_jax.tuning.parameters import free_parameters
 from lio_jax.tuning.train import TRAINING, Schedule, TrainingSession
@@ -23,8 +24,8 @@ SCHEDULE = Schedule(batch=3, epochs=30, rate=0.2, patience=30)
 class Piece:
     """Some samples in place of a recording."""
 
-    def __init__(self, samples):
-        self.samples = samples
+    def __init__(self, samples, name="drive"):
+        self.samples, self.name = samples, name
 
     def __len__(self):
         return len(self.samples)
@@ -45,17 +46,20 @@ class Likelihood:
         return np.array([self(x, [piece]).value for x in xs])
 
 
-def problem(loss=None, judges=(), pieces=SAMPLES):
+def problem(loss=None, judges=(), pieces=SAMPLES, **changed):
     """Return what a training sees of a problem."""
-    return SimpleNamespace(
-        free=FREE,
-        loss=loss or Likelihood(),
-        training=tuple(Piece(piece) for piece in pieces),
-        validation=tuple(Piece(piece) for piece in judges),
-        first=lambda: START,
-        bounds=lambda: Bounds(BEST - 7, BEST + 7),
-        tuned_settings=lambda x: np.array(x),
-    )
+    seen = {
+        "free": FREE,
+        "loss": loss or Likelihood(),
+        "training": tuple(Piece(piece) for piece in pieces),
+        "validation": tuple(Piece(piece) for piece in judges),
+        "first": lambda: START,
+        "bounds": lambda: Bounds(BEST - 7, BEST + 7),
+        "tuned_settings": lambda x: np.array(x),
+        "named": objective_named("pose"),
+        "settings": SimpleNamespace(recipe="default", config=1),
+    }
+    return SimpleNamespace(**{**seen, **changed})
 
 
 def trained(posed, schedule=SCHEDULE, out=None, observer=lambda epoch: None):
@@ -131,16 +135,42 @@ def test_a_loss_without_the_parameters_is_an_error():
         trained(problem(Constant()))
 
 
+OTHER = free_parameters(default_params(), ["imu.gyro_noise", "imu.accel_noise"])
+
+
+def own_loss(observed, truth):
+    return observed.rmse
+
+
 @pytest.mark.parametrize(
-    ("pieces", "seed", "named"),
-    [(SAMPLES[:5], 0, "pieces"), (SAMPLES, 3, "seed")],
-    ids=["other pieces", "another order"],
+    ("changed", "seed", "named"),
+    [
+        ({"pieces": SAMPLES[:5, :9]}, 0, "recordings, pieces"),
+        ({"training": tuple(Piece(piece, "other") for piece in SAMPLES)}, 0, "recordings"),
+        ({"validation": (Piece(SAMPLES[0]),)}, 0, "recordings that judge"),
+        ({"named": objective_named("pose + ranges")}, 0, r"objective \(it has pose\)"),
+        ({"named": as_named(MeanOverScans(own_loss))}, 0, r"objective \(it has pose\)"),
+        ({"free": OTHER}, 0, "parameters"),
+        ({"first": lambda: START + 1}, 0, "start values"),
+        ({"settings": SimpleNamespace(recipe="loam", config=2)}, 0, "recipe, config"),
+        ({}, 3, "seed"),
+    ],
 )
-def test_another_training_is_not_continued(tmp_path, pieces, seed, named):
+def test_another_training_is_not_continued(tmp_path, changed, seed, named):
     short = replace(SCHEDULE, epochs=1)
     trained(problem(), short, tmp_path)
     with pytest.raises(UsageError, match=rf"{TRAINING}: is a training with other {named}; .*--overwrite"):
-        trained(problem(pieces=pieces), replace(short, seed=seed), tmp_path)
+        trained(problem(**changed), replace(short, seed=seed), tmp_path)
+
+
+def test_an_objective_of_ones_own_is_told_from_others_in_any_process():
+    def other_loss(observed, truth):
+        return observed.rmse
+
+    name = as_named(MeanOverScans(own_loss)).name
+    assert name == "MeanOverScans(own_loss, 0)"
+    assert as_named(MeanOverScans(other_loss)).name != name != as_named(MeanOverScans(own_loss, 3)).name
+    assert as_named("noise").name == as_named("pose + ranges").name == "pose+ranges"
 
 
 def test_a_damaged_training_is_named(tmp_path):
