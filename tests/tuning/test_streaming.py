@@ -175,8 +175,7 @@ def test_the_marginal_likelihood_has_a_derivative_by_every_leaf():
     # loose matches of half a second tell little of the samples' noise
     assert by_name["imu.gyro_noise"] != 0
     assert by_name["imu.accel_noise"] != 0
-    assert abs(by_name["smoother.rotation_sigma"]) > 1e-3
-    assert abs(by_name["smoother.translation_sigma"]) > 1e-3
+    assert abs(by_name["registration.information_scale"]) > 1e-3
     # the recipe does not read it
     assert "lidar.angle_sigma" not in by_name
 
