@@ -133,7 +133,7 @@ def linearised(chain: Chain, states: MotionState, sweeps: Sweep) -> Terms:
         lag_residual=jnp.einsum("nij,nj->ni", by_start, off),
         lag_jacobian=by_start @ jax.vmap(local_jacobian)(sweeps.start, start),
         by_world=-jnp.kron(jnp.eye(2), back),
-        prior=chain.prior.quadratic(jax.tree.map(lambda leaf: leaf[0], states)),
+        prior=chain.prior.quadratic(jax.tree.map(lambda leaf: leaf[0], states), chain.prior.tilt),
         prior_log_scale=chain.prior.log_scale,
         duration=links.duration,
     )

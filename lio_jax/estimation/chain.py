@@ -1,4 +1,7 @@
-"""A chain of states with all measurements along it, and its normal equations."""
+"""A chain of states with all measurements along it, and its normal equations.
+
+The direction of gravity is an unknown that all states share, if the prior contains its tilt.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -9,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.estimation.block_tridiagonal import BlockTridiagonal
+from lio_jax.estimation.bordered import Bordered
 from lio_jax.estimation.factors import (
     PoseMeasurement,
     PositionMeasurement,
@@ -27,9 +31,9 @@ class Chain(eqx.Module):
     count: Int32[Array, ""]
     """Number of real states. Later rows are padding, and so are the links to them."""
     gravity: Float[Array, "3"]
-    """Acceleration of gravity, m/s^2, in world."""
+    """Acceleration of gravity, m/s^2, in world, without the tilt."""
     prior: Prior
-    """Prior of the first state."""
+    """Prior of the first state, and of the tilt of gravity where its direction is unknown."""
     imu: Preintegrated
     """Preintegrated samples to the next state; the last row is not used. A link without samples has a large
     covariance."""
@@ -68,12 +72,15 @@ class FactorWeights(NamedTuple):
 
 
 class Normal(eqx.Module):
-    """The cost of a chain's states to second order in their errors."""
+    """The cost of a chain's states and of the tilt to second order in their errors."""
 
-    matrix: BlockTridiagonal
-    """Hessian of the cost, by Gauss-Newton unless exact; the identity for padding."""
+    matrix: Bordered
+    """Hessian of the cost, by Gauss-Newton unless exact; the identity for padding. The tilt is common to all
+    states; its border is empty where the direction of gravity is known."""
     gradient: Float[Array, "n 15"]
     """Gradient of the cost by each state's error."""
+    by_tilt: Float[Array, " q"]
+    """Gradient of the cost by the tilt."""
     cost: Float[Array, ""]
     """Negative log-density of states and measurements, without a constant."""
     weights: FactorWeights
@@ -86,7 +93,11 @@ def information_of(chain: Chain) -> Float[Array, "m 15 15"]:
 
 
 def linearise(
-    chain: Chain, information: Float[Array, "m 15 15"], states: MotionState, exact: bool = False
+    chain: Chain,
+    information: Float[Array, "m 15 15"],
+    states: MotionState,
+    tilt: Float[Array, " q"],
+    exact: bool = False,
 ) -> Normal:
     """Return the normal equations of a chain.
 
@@ -94,6 +105,7 @@ def linearise(
         chain: n rows, at least two.
         information: information of the links, from :func:`information_of`.
         states: n states at which to linearise.
+        tilt: of gravity, at which to linearise, rad.
         exact: include the second derivatives of the residuals, which the derivative of a solution needs. The
             matrix is then the derivative of the gradient, which is symmetric where the gradient vanishes.
     """
@@ -101,16 +113,16 @@ def linearise(
     start = jax.tree.map(lambda rows: rows[:-1], states)
     end = jax.tree.map(lambda rows: rows[1:], states)
 
-    def over(
-        quadratic: Callable[..., Quadratic], dof: int, there: Array, row: Any, *of: MotionState
-    ) -> Quadratic:
+    def over(quadratic: Callable[..., Quadratic], dof: int, there: Array, row: Any, *of: Any) -> Quadratic:
         terms = jax.vmap(_to_second_order(quadratic, dof) if exact else quadratic)(row, *of)
         return jax.tree.map(lambda leaf: jnp.where(_column(there, leaf), leaf, 0.0), terms)
 
     first = jax.tree.map(lambda rows: rows[:1], states)
-    gravity = jnp.broadcast_to(chain.gravity, (len(information), 3))
-    prior = over(Prior.quadratic, DOF, present[:1], jax.tree.map(lambda leaf: leaf[None], chain.prior), first)
-    links = over(_link_quadratic, DOF, present[1:], (_leading(chain.imu), gravity, information), start, end)
+    gravity, tilts = (jnp.broadcast_to(one, (len(information), len(one))) for one in (chain.gravity, tilt))
+    of_prior = jax.tree.map(lambda leaf: leaf[None], chain.prior)
+    prior = over(Prior.quadratic, DOF, present[:1], of_prior, first, tilt[None])
+    link = _leading(chain.imu), gravity, information
+    links = over(_link_quadratic, DOF, present[1:], link, start, end, tilts)
     lidar = over(PoseMeasurement.quadratic, POSE_DOF, present, chain.lidar, states)
     unary = [prior, lidar]
     binary = [links]
@@ -122,10 +134,12 @@ def linearise(
     if chain.gps is not None:
         gps = over(PositionMeasurement.quadratic, POSE_DOF, present, chain.gps, states)
         unary.append(gps)
-    matrix, gradient = _assembled(present, unary, binary)
+    chain_matrix, gradient = _assembled(present, unary, binary)
+    border, corner, slope = _with_tilt(len(present), prior, links)
     return Normal(
-        matrix=matrix,
+        matrix=Bordered(chain_matrix, border, corner),
         gradient=gradient,
+        by_tilt=slope,
         cost=sum((jnp.sum(term.cost) for term in unary + binary), jnp.zeros((), gradient.dtype)),
         weights=FactorWeights(
             lidar.weight, relative.weight if relative else None, gps.weight if gps else None
@@ -136,18 +150,18 @@ def linearise(
 def _assembled(
     present: Array, unary: list[Quadratic], binary: list[Quadratic]
 ) -> tuple[BlockTridiagonal, Array]:
-    """Return the sums of all terms' Hessians and gradients."""
+    """Return the sums of all terms' Hessians and gradients by the states' errors."""
     dtype = unary[0].gradient.dtype
     diagonal = jnp.where(present[:, None, None], 0.0, jnp.eye(DOF, dtype=dtype))
     coupling = jnp.zeros((len(present) - 1, DOF, DOF), dtype)
     gradient = jnp.zeros((len(present), DOF), dtype)
     for term in unary:
-        rows, part = slice(len(term.gradient)), slice(term.gradient.shape[1])
-        diagonal = diagonal.at[rows, part, part].add(term.hessian)
-        gradient = gradient.at[rows, part].add(term.gradient)
+        rows, part = slice(len(term.gradient)), slice(min(term.gradient.shape[1], DOF))
+        diagonal = diagonal.at[rows, part, part].add(term.hessian[:, part, part])
+        gradient = gradient.at[rows, part].add(term.gradient[:, part])
     for term in binary:
-        dof = term.gradient.shape[1] // 2
-        part, first, second = slice(dof), slice(dof), slice(dof, None)
+        dof = min(term.gradient.shape[1] // 2, DOF)
+        part, first, second = slice(dof), slice(dof), slice(dof, 2 * dof)
         diagonal = diagonal.at[:-1, part, part].add(term.hessian[:, first, first])
         diagonal = diagonal.at[1:, part, part].add(term.hessian[:, second, second])
         coupling = coupling.at[:, part, part].add(term.hessian[:, second, first])
@@ -156,23 +170,46 @@ def _assembled(
     return BlockTridiagonal((diagonal + jnp.swapaxes(diagonal, 1, 2)) / 2, coupling), gradient
 
 
-def _link_quadratic(link: tuple, start: MotionState, end: MotionState) -> Quadratic:
+def _with_tilt(count: int, prior: Quadratic, links: Quadratic) -> tuple[Array, Array, Array]:
+    """Return the border and the corner of the Hessian, and the gradient by the tilt.
+
+    Args:
+        count: number of the chain's rows.
+        prior: one term by the errors of the first state and of the tilt.
+        links: terms by the errors of both states and of the tilt.
+    """
+    own, pair = slice(DOF), slice(2 * DOF)
+    border = jnp.zeros((count, DOF, prior.gradient.shape[1] - DOF), prior.gradient.dtype)
+    border = border.at[0].add(prior.hessian[0, own, DOF:])
+    across = links.hessian[:, pair, 2 * DOF :]
+    border = border.at[:-1].add(across[:, own]).at[1:].add(across[:, DOF:])
+    corner = prior.hessian[0, DOF:, DOF:] + jnp.sum(links.hessian[:, 2 * DOF :, 2 * DOF :], axis=0)
+    slope = prior.gradient[0, DOF:] + jnp.sum(links.gradient[:, 2 * DOF :], axis=0)
+    return border, (corner + corner.T) / 2, slope
+
+
+def _link_quadratic(link: tuple, start: MotionState, end: MotionState, tilt: Array) -> Quadratic:
     measured, gravity, information = link
-    return imu_quadratic(measured, gravity, information, start, end)
+    return imu_quadratic(measured, gravity, tilt, information, start, end)
 
 
 def _to_second_order(quadratic: Callable[..., Quadratic], dof: int) -> Callable[..., Quadratic]:
     """Return the same cost with the derivative of its gradient in place of Gauss-Newton's Hessian."""
 
-    def curved(row: Any, *states: MotionState) -> Quadratic:
+    def curved(row: Any, *of: Any) -> Quadratic:
+        states = [one for one in of if isinstance(one, MotionState)]
+        tilts = of[len(states) :]
+
         def gradient(error: Array) -> Array:
-            parts = error.reshape(len(states), dof)
+            parts = error[: dof * len(states)].reshape(len(states), dof)
             padded = jnp.pad(parts, ((0, 0), (0, DOF - dof)))
             moved = [state.retract(part) for state, part in zip(states, padded, strict=True)]
-            return quadratic(row, *moved).gradient
+            turned = [tilt + error[dof * len(states) :] for tilt in tilts]
+            return quadratic(row, *moved, *turned).gradient
 
-        slope = jax.jacfwd(gradient)(jnp.zeros(dof * len(states), states[0].velocity.dtype))
-        return eqx.tree_at(lambda term: term.hessian, quadratic(row, *states), slope)
+        unknowns = dof * len(states) + sum(map(len, tilts))
+        slope = jax.jacfwd(gradient)(jnp.zeros(unknowns, states[0].velocity.dtype))
+        return eqx.tree_at(lambda term: term.hessian, quadratic(row, *of), slope)
 
     return curved
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.error_state import POSITION, ROTATION, VELOCITY
-from lio_jax.core.geometry import adjoint, rotation_matrix, skew
+from lio_jax.core.error_state import POSITION, ROTATION, VELOCITY, sphere_basis
+from lio_jax.core.geometry import adjoint, from_blocks, rotation_matrix, skew
 from lio_jax.core.types import NavState
 from lio_jax.estimation.marginal_prior import Quadratic, quadratic, robust_quadratic
 from lio_jax.estimation.motion_state import POSE_DOF, MotionState
@@ -133,23 +133,55 @@ def predicted(measured: Preintegrated, gravity: Float[Array, "3"], start: Motion
     return MotionState.of(predict(measured, nav))
 
 
+def tilted(gravity: Float[Array, "3"], tilt: Float[Array, " q"]) -> Float[Array, "3"]:
+    """Return gravity turned by a rotation vector normal to it.
+
+    Args:
+        gravity: m/s^2, in world.
+        tilt: the rotation about the two axes of :func:`~lio_jax.core.error_state.sphere_basis`, rad; empty
+            where gravity's direction is known.
+    """
+    if not len(tilt):
+        return gravity
+    return jaxlie.SO3.exp(sphere_basis(gravity) @ tilt) @ gravity
+
+
+def by_tilt(gravity: Float[Array, "3"], tilt: Float[Array, " q"]) -> Float[Array, "3 q"]:
+    """Return the derivative of :func:`tilted` by the tilt."""
+    if not len(tilt):
+        return jnp.zeros((3, 0), gravity.dtype)
+    basis = sphere_basis(gravity)
+    # by the left Jacobian of the rotation
+    return -skew(tilted(gravity, tilt)) @ right_jacobian(-basis @ tilt)[0] @ basis
+
+
 def imu_quadratic(
     measured: Preintegrated,
     gravity: Float[Array, "3"],
+    tilt: Float[Array, " q"],
     information: Float[Array, "15 15"],
     start: MotionState,
     end: MotionState,
 ) -> Quadratic:
-    """Return the cost of the motion from ``start`` to ``end`` as a function of both states' errors.
+    """Return the cost of the motion from ``start`` to ``end`` by the errors of both states and of the tilt.
 
     Args:
         measured: preintegrated from ``start`` to ``end``.
-        gravity: m/s^2, in world.
+        gravity: m/s^2, in world, without the tilt.
+        tilt: of gravity, rad; q is 0 where its direction is known.
         information: from :func:`imu_information`.
         start: state at the first instant.
         end: state at the last instant.
     """
-    residual, jacobian = imu_residual(measured, gravity, start, end)
+    residual, jacobian = imu_residual(measured, tilted(gravity, tilt), start, end)
+    fall = rotation_matrix(end.T_world_imu.rotation()).T @ by_tilt(gravity, tilt)
+    elapsed = jnp.where(measured.measured, measured.duration, 0.0)
+    by_fall = from_blocks(
+        (15, len(tilt)),
+        (POSITION, slice(0, len(tilt)), elapsed**2 / 2 * fall),
+        (VELOCITY, slice(0, len(tilt)), elapsed * fall),
+    )
+    jacobian = jnp.concatenate([jacobian, by_fall], axis=1)
     return quadratic(residual, jacobian, information, jnp.ones((), residual.dtype))
 
 

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from lio_jax.estimation.block_tridiagonal import log_determinant
+from lio_jax.core.error_state import sphere_basis
+from lio_jax.core.geometry import rotation_matrix
+from lio_jax.estimation.bordered import log_determinant_bordered
 from lio_jax.estimation.chain import Chain, information_of, linearise
 from lio_jax.estimation.factors import (
     PoseMeasurement,
@@ -17,6 +19,7 @@ from lio_jax.estimation.factors import (
     RelativePose,
     imu_information,
     predicted,
+    tilted,
 )
 from lio_jax.estimation.innovation import square_root_information
 from lio_jax.estimation.marginal_prior import LOG_2PI, Prior, Quadratic, marginalised
@@ -28,7 +31,7 @@ from lio_jax.imu.preintegration import Preintegrated
 def log_evidence(chain: Chain, smoothed: Smoothed) -> Float[Array, ""]:
     """Return the log marginal likelihood of all measurements, by Laplace's approximation.
 
-    ``log p(z) = log p(z, x) + DOF n / 2 log(2 pi) - log|H| / 2`` at the most probable states x, with the
+    ``log p(z) = log p(z, x) + d / 2 log(2 pi) - log|H| / 2`` at the d most probable unknowns x, with the
     Gauss-Newton Hessian H (MacKay, "Information theory, inference, and learning algorithms", 2003, chapter
     27). It is exact for a linear Gaussian model. A robust kernel changes the cost and the Hessian, but not
     the normalisation of a measurement's density: an outlier keeps a cost, but does not dominate. The
@@ -38,8 +41,8 @@ def log_evidence(chain: Chain, smoothed: Smoothed) -> Float[Array, ""]:
         chain: the measurements.
         smoothed: the most probable states of the chain.
     """
-    matrix = smoothed.normal.matrix
-    volume = DOF * chain.count / 2 * LOG_2PI - log_determinant(matrix) / 2
+    matrix, unknowns = smoothed.normal.matrix, DOF * chain.count + len(smoothed.tilt)
+    volume = unknowns / 2 * LOG_2PI - log_determinant_bordered(matrix) / 2
     return log_scale(chain) - smoothed.normal.cost + volume
 
 
@@ -77,10 +80,16 @@ class Window(eqx.Module):
     """Measurements of the states."""
     states: MotionState
     """n states; rows from ``chain.count`` on are padding."""
+    tilt: Float[Array, " q"]
+    """Tilt of gravity, rad; empty where its direction is known."""
 
     def latest(self) -> MotionState:
         """Return the newest state."""
         return jax.tree.map(lambda rows: rows[self.chain.count - 1], self.states)
+
+    def gravity(self) -> Float[Array, "3"]:
+        """Return the acceleration of gravity, m/s^2, in world."""
+        return tilted(self.chain.gravity, self.tilt)
 
 
 class Added(eqx.Module):
@@ -101,8 +110,8 @@ def open_window(capacity: int, prior: Prior, gravity: Float[Array, "3"], first: 
 
     Args:
         capacity: largest number of states, at least two.
-        prior: prior of the first state.
-        gravity: m/s^2, in world.
+        prior: prior of the first state, and of the tilt of gravity where its direction is unknown.
+        gravity: m/s^2, in world, without the tilt.
         first: measurements of the first state. The window has room for relative poses and GPS only if
             ``first`` has them. Its ``link`` and ``relative`` are not used otherwise.
     """
@@ -118,7 +127,7 @@ def open_window(capacity: int, prior: Prior, gravity: Float[Array, "3"], first: 
 
     blank = jax.tree.map(rows, padding)
     chain = Chain(jnp.int32(1), gravity, prior, blank.link, blank.lidar, blank.relative, blank.gps)
-    window = Window(chain, jax.tree.map(rows, prior.origin))
+    window = Window(chain, jax.tree.map(rows, prior.origin), prior.tilt)
     return _with_measurements(window, first, jnp.int32(0))
 
 
@@ -134,14 +143,14 @@ def append(window: Window, added: Added) -> Window:
     full = window.chain.count == window.states.velocity.shape[0]
     window = jax.lax.cond(full, forget_oldest, lambda window: window, window)
     chain, row = window.chain, window.chain.count
-    new = predicted(added.link, chain.gravity, window.latest())
+    new = predicted(added.link, window.gravity(), window.latest())
     states = jax.tree.map(lambda rows, state: rows.at[row].set(state), window.states, new)
     imu = jax.tree.map(lambda rows, link: rows.at[row - 1].set(link), chain.imu, added.link)
     chain = eqx.tree_at(lambda chain: (chain.count, chain.imu), chain, (row + 1, imu))
     if added.relative is not None:
         relative = jax.tree.map(lambda rows, leaf: rows.at[row - 1].set(leaf), chain.relative, added.relative)
         chain = eqx.tree_at(lambda chain: chain.relative, chain, relative)
-    return _with_measurements(Window(chain, states), added, row)
+    return _with_measurements(Window(chain, states, window.tilt), added, row)
 
 
 def update(window: Window, *, max_iterations: int, tolerance: Float[Array, ""]) -> tuple[Window, Smoothed]:
@@ -152,8 +161,10 @@ def update(window: Window, *, max_iterations: int, tolerance: Float[Array, ""]) 
         max_iterations: see :func:`smooth`.
         tolerance: see :func:`smooth`.
     """
-    smoothed = smooth(window.chain, window.states, max_iterations=max_iterations, tolerance=tolerance)
-    return Window(window.chain, smoothed.states), smoothed
+    smoothed = smooth(
+        window.chain, window.states, window.tilt, max_iterations=max_iterations, tolerance=tolerance
+    )
+    return Window(window.chain, smoothed.states, smoothed.tilt), smoothed
 
 
 def append_and_update(
@@ -179,37 +190,61 @@ def forget_oldest(window: Window) -> Window:
     if pair.gps is not None:
         pair = eqx.tree_at(lambda chain: chain.gps.mask, pair, pair.gps.mask.at[1].set(False))
     states = jax.tree.map(lambda rows: rows[:2], window.states)
-    normal = linearise(pair, information_of(pair), states)
-    (first, second), across = normal.matrix.diagonal, normal.matrix.coupling[0]
+    normal = linearise(pair, information_of(pair), states, window.tilt)
+    (first, second), across = normal.matrix.chain.diagonal, normal.matrix.chain.coupling[0]
+    border = normal.matrix.border.reshape(2 * DOF, -1)
+    own = jnp.block([[first, across.T], [across, second]])
     joint = Quadratic(
         cost=normal.cost,
-        gradient=normal.gradient.ravel(),
-        hessian=jnp.block([[first, across.T], [across, second]]),
+        gradient=jnp.concatenate([normal.gradient.ravel(), normal.by_tilt]),
+        hessian=jnp.block([[own, border], [border.T, normal.matrix.corner]]),
         weight=jnp.ones_like(normal.cost),
     )
-    prior = marginalised(joint, log_scale(pair), jax.tree.map(lambda rows: rows[1], states))
+    following = jax.tree.map(lambda rows: rows[1], states)
+    prior = marginalised(joint, log_scale(pair), following, window.tilt)
     fewer = chain.map_rows(_moved_up)
     fewer = eqx.tree_at(lambda chain: (chain.count, chain.prior), fewer, (chain.count - 1, prior))
-    return Window(fewer, jax.tree.map(_moved_up, window.states))
+    return Window(fewer, jax.tree.map(_moved_up, window.states), window.tilt)
 
 
 def moved_by(window: Window, T_new_old: jaxlie.SE3) -> Window:
     """Return the window in another world frame with the same vertical.
 
-    Information and covariances refer to right perturbations, and preintegrated samples to the IMU, so they
-    stay as they are.
+    Information and covariances of states refer to right perturbations, and preintegrated samples to the IMU,
+    so they stay as they are. The tilt of gravity is about axes of the world, and turns with them.
 
     Args:
         window: without GPS positions.
-        T_new_old: from the old frame to the new one, m; its rotation is about the vertical, so gravity stays.
+        T_new_old: from the old frame to the new one, m; its rotation is about the axis of ``chain.gravity``,
+            which is gravity without its tilt.
     """
-    chain = window.chain
-    chain = eqx.tree_at(
-        lambda chain: (chain.prior.origin, chain.lidar.T_world_imu),
-        chain,
-        (chain.prior.origin.moved_by(T_new_old), T_new_old @ chain.lidar.T_world_imu),
+    chain, prior = window.chain, window.chain.prior
+    turn = turn_of_tilt(chain.gravity, T_new_old)[: len(window.tilt), : len(window.tilt)]
+    unknowns = jax.scipy.linalg.block_diag(jnp.eye(DOF, dtype=turn.dtype), turn)
+    moved = Prior(
+        origin=prior.origin.moved_by(T_new_old),
+        tilt=turn @ prior.tilt,
+        information=unknowns @ prior.information @ unknowns.T,
+        gradient=unknowns @ prior.gradient,
+        log_scale=prior.log_scale,
     )
-    return Window(chain, window.states.moved_by(T_new_old))
+    chain = eqx.tree_at(
+        lambda chain: (chain.prior, chain.lidar.T_world_imu),
+        chain,
+        (moved, T_new_old @ chain.lidar.T_world_imu),
+    )
+    return Window(chain, window.states.moved_by(T_new_old), turn @ window.tilt)
+
+
+def turn_of_tilt(gravity: Float[Array, "3"], T_new_old: jaxlie.SE3) -> Float[Array, "2 2"]:
+    """Return the matrix by which the tilt of gravity turns with the world.
+
+    Args:
+        gravity: without the tilt, m/s^2.
+        T_new_old: from the old world to the new one; its rotation is about ``gravity``.
+    """
+    axes = sphere_basis(gravity)
+    return axes.T @ rotation_matrix(T_new_old.rotation()) @ axes
 
 
 def _moved_up(rows: Array) -> Array:
@@ -222,7 +257,7 @@ def _with_measurements(window: Window, added: Added, row: Array) -> Window:
     chain = eqx.tree_at(lambda chain: chain.lidar, chain, jax.tree.map(put, chain.lidar, added.lidar))
     if added.gps is not None:
         chain = eqx.tree_at(lambda chain: chain.gps, chain, jax.tree.map(put, chain.gps, added.gps))
-    return Window(chain, window.states)
+    return Window(chain, window.states, window.tilt)
 
 
 def still_link(dtype: jnp.dtype) -> Preintegrated:

@@ -15,7 +15,8 @@ from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.implicit import ImplicitSolution, Problem, implicit
 from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, NOT_FINITE
-from lio_jax.estimation.block_tridiagonal import BlockTridiagonal, factorise, inverse_blocks, solve
+from lio_jax.estimation.block_tridiagonal import BlockTridiagonal
+from lio_jax.estimation.bordered import Bordered, factorise_bordered, inverse_bordered, solve_bordered
 from lio_jax.estimation.chain import Chain, Normal, information_of, linearise
 from lio_jax.estimation.motion_state import DOF, MotionState
 
@@ -33,8 +34,10 @@ class Smoothed(eqx.Module):
 
     states: MotionState
     """The most probable n states."""
+    tilt: Float[Array, " q"]
+    """The most probable tilt of gravity, rad; empty where gravity's direction is known."""
     normal: Normal
-    """Normal equations at ``states``."""
+    """Normal equations at ``states`` and ``tilt``."""
     status: Int32[Array, ""]
     """CONVERGED, ITERATION_LIMIT or NOT_FINITE; in the last case the states are the last finite ones."""
     iterations: Int32[Array, ""]
@@ -46,16 +49,26 @@ class Smoothed(eqx.Module):
 
     def covariances(self) -> Float[Array, "n 15 15"]:
         """Return the marginal covariance of each state's error; the identity for padding."""
-        return inverse_blocks(factorise(self.normal.matrix)).diagonal
+        return inverse_bordered(factorise_bordered(self.normal.matrix)).chain.diagonal
+
+    def joint_covariance(self, row: Int32[Array, ""]) -> Float[Array, "p p"]:
+        """Return the joint covariance of the errors of one state and of the tilt, p = 15 + q.
+
+        Args:
+            row: of the state.
+        """
+        inverse = inverse_bordered(factorise_bordered(self.normal.matrix))
+        across = inverse.border[row]
+        return jnp.block([[inverse.chain.diagonal[row], across], [across.T, inverse.corner]])
 
 
 class _Loop(NamedTuple):
-    trial: MotionState
-    """The states after the last step, whose cost is not known yet."""
-    states: MotionState
-    """The best states so far."""
+    trial: tuple[MotionState, Array]
+    """The states and the tilt after the last step, whose cost is not known yet."""
+    best: tuple[MotionState, Array]
+    """The best states and tilt so far."""
     normal: Normal
-    """Normal equations at ``states``."""
+    """Normal equations at ``best``."""
     damping: Float[Array, ""]
     decrement: Float[Array, ""]
     iterations: Int32[Array, ""]
@@ -66,6 +79,7 @@ class _Found(NamedTuple):
     """The part of the result that the derivative takes as constant."""
 
     states: MotionState
+    tilt: Float[Array, " q"]
     decrement: Float[Array, ""]
     iterations: Int32[Array, ""]
     done: Bool[Array, ""]
@@ -74,6 +88,7 @@ class _Found(NamedTuple):
 def smooth(
     chain: Chain,
     guess: MotionState,
+    tilt: Float[Array, " q"] | None = None,
     *,
     max_iterations: int | Int32[Array, ""],
     tolerance: Float[Array, ""],
@@ -87,18 +102,21 @@ def smooth(
     Args:
         chain: n rows, at least two; rows from ``chain.count`` on are padding.
         guess: n states, the first iterate.
+        tilt: of gravity, the first iterate, rad; None: that of the prior.
         max_iterations: largest number of linearisations, at least 1, those of rejected steps included.
         tolerance: length of the next step below which the solve has converged, standard deviations.
     """
     problem = Problem(_solve, _no_probe, _gradient, _report, inverse_slope=_inverse_hessian)
-    solution = implicit(problem, (chain, guess, tolerance, max_iterations))
-    states, normal = solution.reported
+    first = guess, chain.prior.tilt if tilt is None else tilt
+    solution = implicit(problem, (chain, first, tolerance, max_iterations))
+    states, tilt, normal = solution.reported
     found: _Found = solution.selection
     finite = jnp.isfinite(normal.cost) & jnp.isfinite(found.decrement)
     status = jnp.where(found.done, CONVERGED, jnp.where(finite, ITERATION_LIMIT, NOT_FINITE))
     linked = chain.present()[1:]
     return Smoothed(
         states=states,
+        tilt=tilt,
         normal=normal,
         status=status.astype(jnp.int32),
         iterations=found.iterations,
@@ -112,8 +130,8 @@ def _solve(inputs: Any) -> ImplicitSolution:
     information = information_of(chain)
 
     @jax.jit
-    def normal_at(states: MotionState) -> Normal:
-        return linearise(chain, information, states)
+    def normal_at(at: tuple[MotionState, Array]) -> Normal:
+        return linearise(chain, information, *at)
 
     def iterate(loop: _Loop) -> _Loop:
         normal = normal_at(loop.trial)
@@ -122,14 +140,16 @@ def _solve(inputs: Any) -> ImplicitSolution:
         pays = normal.cost <= loop.normal.cost + rounding
         less = jnp.where(loop.damping > _LEAST_DAMPING, loop.damping / _WORTH, 0.0)
         damping = jnp.where(pays, less, jnp.maximum(loop.damping * _WORTH, _FIRST_DAMPING))
-        states, normal = jax.tree.map(
-            lambda new, old: jnp.where(pays, new, old), (loop.trial, normal), (loop.states, loop.normal)
+        (states, tilt), normal = jax.tree.map(
+            lambda new, old: jnp.where(pays, new, old), (loop.trial, normal), (loop.best, loop.normal)
         )
-        step = -solve(factorise(_damped(normal.matrix, damping)), normal.gradient)
-        decrement = jnp.sqrt(jnp.abs(jnp.sum(step * normal.gradient)))
+        factor = factorise_bordered(_damped(normal.matrix, damping))
+        step, turn = solve_bordered(factor, -normal.gradient, -normal.by_tilt)
+        gained = jnp.sum(step * normal.gradient) + jnp.sum(turn * normal.by_tilt)
+        decrement = jnp.sqrt(jnp.abs(gained))
         return _Loop(
-            trial=states.retract(step),
-            states=states,
+            trial=(states.retract(step), tilt + turn),
+            best=(states, tilt),
             normal=normal,
             damping=damping,
             decrement=decrement,
@@ -146,15 +166,19 @@ def _solve(inputs: Any) -> ImplicitSolution:
     zero = jnp.zeros((), blank.cost.dtype)
     start = _Loop(guess, guess, blank, zero, zero, jnp.int32(0), jnp.array(False))
     loop = jax.lax.while_loop(unfinished, iterate, start)
-    root = jnp.zeros(blank.gradient.size, blank.gradient.dtype)
-    kept = _Found(loop.states, loop.decrement, loop.iterations, loop.done)
-    return ImplicitSolution(root, kept, (loop.states, loop.normal))
+    root = jnp.zeros(blank.gradient.size + blank.by_tilt.size, blank.gradient.dtype)
+    kept = _Found(*loop.best, loop.decrement, loop.iterations, loop.done)
+    return ImplicitSolution(root, kept, (*loop.best, loop.normal))
 
 
-def _damped(matrix: BlockTridiagonal, damping: Array) -> BlockTridiagonal:
+def _damped(matrix: Bordered, damping: Array) -> Bordered:
     """Return the matrix with its diagonal increased by a share of itself (Marquardt 1963)."""
-    scale = 1 + damping * jnp.eye(DOF, dtype=matrix.diagonal.dtype)
-    return BlockTridiagonal(matrix.diagonal * scale, matrix.coupling)
+
+    def scale(size: int) -> Array:
+        return 1 + damping * jnp.eye(size, dtype=matrix.corner.dtype)
+
+    chain = BlockTridiagonal(matrix.chain.diagonal * scale(DOF), matrix.chain.coupling)
+    return Bordered(chain, matrix.border, matrix.corner * scale(len(matrix.corner)))
 
 
 def _no_probe(error: Array, found: _Found, inputs: Any) -> None:
@@ -163,16 +187,27 @@ def _no_probe(error: Array, found: _Found, inputs: Any) -> None:
 
 def _gradient(error: Array, probed: None, found: _Found, inputs: Any) -> Array:
     """Return the gradient of the cost at the solution perturbed by ``error``; it vanishes at zero error."""
-    return _report(error, probed, found, inputs)[1].gradient.ravel()
+    normal = _report(error, probed, found, inputs)[2]
+    return jnp.concatenate([normal.gradient.ravel(), normal.by_tilt])
 
 
-def _report(error: Array, probed: None, found: _Found, inputs: Any) -> tuple[MotionState, Normal]:
+def _report(
+    error: Array, probed: None, found: _Found, inputs: Any
+) -> tuple[MotionState, Float[Array, " q"], Normal]:
     chain = inputs[0]
-    states = found.states.retract(error.reshape(-1, DOF))
-    return states, linearise(chain, information_of(chain), states)
+    of_states, of_tilt = _apart(error, found)
+    states, tilt = found.states.retract(of_states), found.tilt + of_tilt
+    return states, tilt, linearise(chain, information_of(chain), states, tilt)
 
 
 def _inverse_hessian(error: Array, found: _Found, inputs: Any, right: Array) -> Array:
     chain = inputs[0]
-    exact = linearise(chain, information_of(chain), found.states, exact=True)
-    return solve(factorise(exact.matrix), right.reshape(-1, DOF)).ravel()
+    exact = linearise(chain, information_of(chain), found.states, found.tilt, exact=True)
+    solved = solve_bordered(factorise_bordered(exact.matrix), *_apart(right, found))
+    return jnp.concatenate([part.ravel() for part in solved])
+
+
+def _apart(unknowns: Array, found: _Found) -> tuple[Float[Array, "n 15"], Float[Array, " q"]]:
+    """Return the entries of the states and those of the tilt."""
+    end = len(unknowns) - len(found.tilt)
+    return unknowns[:end].reshape(-1, DOF), unknowns[end:]

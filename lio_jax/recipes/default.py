@@ -33,7 +33,8 @@ class Default(Recipe[DefaultConfig, DefaultParams, DefaultState]):
         "params.registration.least_width": 0.04,
     }
 
-    noise_from_recording = True
+    inertial_noise_from_recording = True
+    range_noise_from_recording = True
 
     def init(self, params: DefaultParams, imu: ImuBatch | None = None) -> DefaultState:
         """Return the state before the first scan; its form depends on whether there are inertial samples."""

@@ -17,17 +17,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float
 
-from lio_jax.core.error_state import DOF as NAV_DOF
 from lio_jax.core.error_state import NavEstimate
 from lio_jax.core.errors import UsageError
-from lio_jax.core.geometry import from_blocks
 from lio_jax.core.types import CONVERGED, ITERATION_LIMIT, ImuBatch, NavState, Scan, state_dtype
-from lio_jax.estimation.map_drift import MapDrift
-from lio_jax.estimation.motion_state import DOF
-from lio_jax.estimation.sliding_window import Window, log_evidence, moved_by
-from lio_jax.estimation.smoother import Smoothed
+from lio_jax.estimation.latest_error import LatestError
+from lio_jax.estimation.sliding_window import log_evidence, moved_by, turn_of_tilt
 from lio_jax.lidar.features import (
     check_sizes,
 )
@@ -45,6 +40,7 @@ from lio_jax.recipes.lio_sam_stages import (
     as_nav,
     clock_at,
     compensated,
+    in_the_map,
     keyframe,
     picked_features,
     predict,
@@ -52,7 +48,7 @@ from lio_jax.recipes.lio_sam_stages import (
     smooth,
 )
 from lio_jax.recipes.recipe import KeyframeTable, Needs, Output, Recipe
-from lio_jax.recipes.smoothed_odometry import measured_attitude, opened
+from lio_jax.recipes.smoothed_odometry import measured_attitude, nav_covariance, opened, unknowns_covariance
 
 
 class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
@@ -61,6 +57,7 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
     needs = Needs(imu="required", rings=True)
     config_type = LioSamConfig
     params_type = LioSamParams
+    inertial_noise_from_recording = True
     # LIO-SAM's values for indoors
     near_values: ClassVar[Mapping[str, float]] = {
         "params.map.voxel_size": 0.2,
@@ -98,7 +95,8 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
                 "call jax.config.update('jax_enable_x64', True) before anything else."
             )
         check_sizes(config)
-        nav = levelled_start(params, imu).nav
+        start = levelled_start(params, imu)
+        nav = start.nav
         attitude, there = measured_attitude(imu, jnp.max(imu.time), nav.T_world_imu.rotation())
         if not config.imu.heading:
             level = attitude.as_rpy_radians()
@@ -106,15 +104,17 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
         rotation = jaxlie.SO3(jnp.where(there, attitude.wxyz, nav.T_world_imu.rotation().wxyz))
         T_world_imu = jaxlie.SE3.from_rotation_and_translation(rotation, nav.T_world_imu.translation())
         nav = dataclasses.replace(nav, T_world_imu=T_world_imu)
+        start = NavEstimate(nav, start.covariance)
+        window = opened(config, params, start)
         zero = jnp.zeros((), nav.velocity.dtype)
         keyframes = no_keyframes(own.keyframes, own.corner_points, own.surface_points, zero.dtype)
         return LioSamState(
             nav=nav,
-            window=opened(config, params, nav),
+            window=window,
             time=zero,
             matched_at=zero - jnp.inf,
             scans=jnp.int32(0),
-            drift=MapDrift.none(zero.dtype),
+            error=LatestError.of(unknowns_covariance(start)),
             map=Submap(keyframes, empty_feature_map(config.map.capacity)),
         )
 
@@ -144,22 +144,21 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
         nav = dataclasses.replace(as_nav(state.nav, smoothing.window), T_world_imu=smoothing.T_world_imu)
         with jax.named_scope("keyframe"):
             added = keyframe(params, state, clock, points, nav, features, match, smoothing.failed)
-        covariance = _covariance(smoothing.smoothed, smoothing.window)
-        drift = state.drift.carried(state.nav.T_world_imu, nav.T_world_imu)
-        drift = drift.with_pose_of(covariance, match.new_piece)
+        with jax.named_scope("covariance"):
+            error = in_the_map(config, params, state, nav, points, match, smoothing, added)
         new_state = LioSamState(
             nav=nav,
             window=smoothing.window,
             time=clock.time,
             matched_at=jnp.where(match.used | match.new_piece, clock.time, state.matched_at),
             scans=state.scans + features.seen.astype(jnp.int32),
-            drift=drift,
+            error=error,
             map=added.submap,
         )
         output = _output(nav, clock, features, match, smoothing, added)
         return new_state, dataclasses.replace(
             output,
-            covariance=drift.added_to(NavEstimate(nav, covariance)),
+            covariance=nav_covariance(error.state, smoothing.window),
             keyframes=_table(state.map.keyframes, added.submap.keyframes, clock),
         )
 
@@ -180,8 +179,9 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
     ) -> LioSamState:
         """Return the state with corrected keyframes, as LIO-SAM's ``correctPoses`` leaves them.
 
-        The vehicle and the smoother's window move rigidly, the velocity turns with them, and gravity stays.
-        The map around the vehicle is built anew. Covariances stay: they refer to right perturbations.
+        The vehicle and the smoother's window move rigidly, and velocity and the tilt of gravity turn with
+        them. The map around the vehicle is built anew. Covariances of states refer to right perturbations and
+        stay, and so does that of the map's error.
 
         Args:
             params: traced.
@@ -193,7 +193,10 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
         submap = rebuilt(
             state.map, keyframes, lidar_pose(nav), state.time, params.map, params.point_map, params.submap
         )
-        return dataclasses.replace(state, nav=nav, window=moved_by(state.window, T_new_old), map=submap)
+        window = moved_by(state.window, T_new_old)
+        error = state.error.turned(turn_of_tilt(state.window.chain.gravity, T_new_old))
+        nav = dataclasses.replace(nav, gravity=window.gravity())
+        return dataclasses.replace(state, nav=nav, window=window, error=error, map=submap)
 
 
 def _table(before: Keyframes, after: Keyframes, clock: Clock) -> KeyframeTable:
@@ -221,8 +224,8 @@ def _output(
             status=jnp.where(unfinished, ITERATION_LIMIT, found.status),
         ),
         lost=match.lost,
-        nis=jnp.zeros_like(clock.end),
-        nis_dof=jnp.int32(0),
+        nis=smoothing.innovation.nis,
+        nis_dof=smoothing.innovation.dof,
         points=jnp.concatenate([placed.corner + offset, placed.surface]),
         points_mask=jnp.concatenate([placed.corner_mask, placed.surface_mask]),
         added=jnp.concatenate([added.corner.added[:corners], added.surface.added[:surfaces]]),
@@ -236,10 +239,3 @@ def _output(
         restarted=smoothing.failed,
         smoother_unfinished=unfinished,
     )
-
-
-def _covariance(smoothed: Smoothed, window: Window) -> Float[Array, "24 24"]:
-    """Return the marginal covariance of the latest state, at its place in the navigation state's error."""
-    latest = smoothed.covariances()[window.chain.count - 1]
-    motion = slice(0, DOF)
-    return from_blocks((NAV_DOF, NAV_DOF), (motion, motion, latest))

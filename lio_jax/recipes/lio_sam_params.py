@@ -34,8 +34,6 @@ class SmootherParams(eqx.Module):
     kernel: Scalar = leaf(1e6, "sigmas", above=0, tuned="log")
     """Scale of the robust kernel on scan matches. It is wide: a narrow kernel would reject all matches once
     the velocity is wrong."""
-    position_sigma: Scalar = leaf(0.01, "m", above=0, tuned="log")
-    """Standard deviation of the first position."""
     tolerance: Scalar = leaf(1e-3, "sigmas", above=0)
     """The smoother has converged when the next step would be shorter than this."""
     tilt_weight: Scalar = leaf(0.01, least=0, most=1, tuned="log")
@@ -55,27 +53,15 @@ class LioSamMatch(GaussNewtonMatch, WeighedMatch):
 class LioSamParams(InertialParams):
     """Traced parameters of LIO-SAM, in SI units."""
 
-    imu: ImuParams = section(
-        ImuParams,
-        gyro_noise=1.5636343949698187e-03,
-        accel_noise=3.9939570888238808e-03,
-        gyro_bias_walk=3.5640318696367613e-05,
-        accel_bias_walk=6.4356659353532566e-05,
-        gravity=9.80511,
-    )
+    # LIO-SAM's own densities, first biases and gravity are those of one sensor at one place
+    imu: ImuParams = section(ImuParams)
     # LIO-SAM's velocity sigma of 1e4 next to a sample's information is singular in double precision
-    initial: InitialParams = section(
-        InitialParams,
-        rotation_sigma=1e-2,
-        velocity_sigma=100.0,
-        gyro_bias_sigma=1e-3,
-        accel_bias_sigma=1e-3,
-    )
+    initial: InitialParams = section(InitialParams, velocity_sigma=100.0)
     lidar: LidarParams = section(LidarParams, min_range=1.0, max_range=1000.0)
     map: FeatureMapParams = section(FeatureMapParams, voxel_size=0.4, corner_voxel_size=0.2)
     registration: LioSamMatch = section(
         LioSamMatch,
-        information_scale=0.03,
+        information_scale=1.0,
         reassociation_distance=0.05,
         rotation_tolerance=0.05 * _DEGREE,
         translation_tolerance=5e-4,
@@ -98,8 +84,9 @@ class LioSamSizes:
     """Number of states that are smoothed together. Older states are marginalised."""
     smoother_iterations: int = static(5, above=0)
     """Largest number of linearisations of the window."""
-    lidar_noise: Literal["fixed", "information"] = static("fixed")
-    """Noise of a scan match in the smoother: the fixed sigmas of ``params.smoother``, or its information."""
+    lidar_noise: Literal["fixed", "information"] = static("information")
+    """Noise of a scan match in the smoother: its information, and the pose is the smoothed one; or LIO-SAM's
+    fixed sigmas of ``params.smoother``, and the pose is the matched one."""
     keyframes: int = static(256, above=0)
     """Capacity of keyframes on the device. Beyond it the submap's spent keyframes are dropped first, then the
     farthest ones. A run keeps these on the host, and they come back near the vehicle."""

@@ -13,13 +13,18 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
+from lio_jax.core.geometry import rotation_matrix
 from lio_jax.core.types import LOST, ImuBatch, NavState, Scan, state_dtype
 from lio_jax.estimation.chain import information_of, linearise
-from lio_jax.estimation.map_drift import MapDrift
+from lio_jax.estimation.factors import PoseMeasurement
+from lio_jax.estimation.innovation import Innovation
+from lio_jax.estimation.latest_error import LatestError, unless
+from lio_jax.estimation.map_drift import error_by_planes
+from lio_jax.estimation.pose_logarithm import log_and_jacobian
 from lio_jax.estimation.sliding_window import Added, Window, append_and_update
 from lio_jax.estimation.smoother import Smoothed
 from lio_jax.imu.path import Path, deskew_along
-from lio_jax.imu.preintegration import preintegrate_parallel
+from lio_jax.imu.preintegration import Preintegrated, preintegrate_parallel
 from lio_jax.imu.sampling import sample_intervals
 from lio_jax.imu.strapdown import path_along
 from lio_jax.lidar.features import (
@@ -40,7 +45,7 @@ from lio_jax.recipes.smoothed_odometry import (
     drawn_to_tilt,
     match_as_measurement,
     measured_attitude,
-    opened,
+    opened_anew,
     runs_away,
     within_limits,
 )
@@ -50,6 +55,8 @@ from lio_jax.registration.scan_match import FixedPoints
 
 _TIME_SLACK = 1e-3
 """Sweeps do not end to the last bit in time, s."""
+_PLANE_SHARE = 5.0
+"""Variance of the pose by the errors of the map's lines and planes, as a share of that by a match."""
 
 
 class LioSamState(recipe.State):
@@ -65,8 +72,8 @@ class LioSamState(recipe.State):
     """The same of the last scan that was matched."""
     scans: Int32[Array, ""]
     """Scans with points seen so far."""
-    drift: MapDrift
-    """Errors of the predicted poses at which pieces of the map began."""
+    error: LatestError
+    """Covariance of the latest state's error in the world, and of the map's error."""
     map: Submap
 
     def varying_map(self) -> Submap:
@@ -249,7 +256,12 @@ class Smoothing(eqx.Module):
     smoothed: Smoothed
     """The smoother's result, of the window that is kept."""
     T_world_imu: jaxlie.SE3
-    """The matched pose; after a failure the last one, carried on at the last velocity."""
+    """The smoothed pose, or the matched one with fixed sigmas; after a failure the last one, carried on at
+    the last velocity."""
+    error: LatestError
+    """Covariance of the latest state's error, before the scan is added to the map."""
+    innovation: Innovation
+    """Of the scan match."""
     failed: Bool[Array, ""]
     """Velocity or biases ran away, and the window began anew."""
 
@@ -276,13 +288,21 @@ def smooth(
         imu: samples around the time since the last scan's end.
         match: the scan's.
     """
-    window, smoothed = _appended(config, params, state, clock, points, imu, match)
+    link, measured = _measurements(config, params, state, clock, points, imu, match)
+    window, smoothed = append_and_update(
+        state.window,
+        Added(link, measured),
+        max_iterations=config.lio_sam.smoother_iterations,
+        tolerance=params.smoother.tolerance,
+    )
     failed = runs_away(window.latest(), params) & ~clock.first
     # neither the samples that led astray nor a match that began at their prediction
     place = state.nav.T_world_imu.translation() + clock.interval * prediction.velocity
     coasted = jaxlie.SE3.from_rotation_and_translation(prediction.T_world_imu.rotation(), place)
-    T_world_imu = jaxlie.SE3(jnp.where(failed, coasted.wxyz_xyz, match.T_world_imu.wxyz_xyz))
-    fresh = opened(config, params, _at_rest(state.nav, T_world_imu), params.smoother.degenerate_sigma)
+    smoothing = (config.lio_sam.lidar_noise == "information") & ~clock.first
+    found = jnp.where(smoothing, window.latest().T_world_imu.wxyz_xyz, match.T_world_imu.wxyz_xyz)
+    T_world_imu = jaxlie.SE3(jnp.where(failed, coasted.wxyz_xyz, found))
+    fresh = opened_anew(config, params, _at_rest(state.nav, T_world_imu), state.window)
     window = jax.tree.map(
         lambda old, new, anew: jnp.where(clock.first, old, jnp.where(failed, anew, new)),
         state.window,
@@ -292,16 +312,41 @@ def smooth(
     # of the window that is kept, whichever it is
     normal = jax.lax.cond(
         clock.first | failed,
-        lambda kept, _: linearise(kept.chain, information_of(kept.chain), kept.states),
+        lambda kept, _: linearise(kept.chain, information_of(kept.chain), kept.states, kept.tilt),
         lambda _, normal: normal,
         window,
         smoothed.normal,
     )
-    smoothed = dataclasses.replace(smoothed, states=window.states, normal=normal)
-    return Smoothing(window, smoothed, T_world_imu, failed)
+    smoothed = dataclasses.replace(smoothed, states=window.states, tilt=window.tilt, normal=normal)
+    error, innovation = _judged(state, link, measured, prediction, smoothed, window, clock.first, failed)
+    return Smoothing(window, smoothed, T_world_imu, error, innovation, failed)
 
 
-def _appended(
+def _judged(
+    state: LioSamState,
+    link: Preintegrated,
+    measured: PoseMeasurement,
+    prediction: Prediction,
+    smoothed: Smoothed,
+    window: Window,
+    first: Bool[Array, ""],
+    failed: Bool[Array, ""],
+) -> tuple[LatestError, Innovation]:
+    """Return the covariance of the latest state's error after a scan match, and the match's innovation."""
+    last = window.chain.count - 1
+    ends = [jax.tree.map(lambda rows, row=row: rows[row], smoothed.states) for row in (last - 1, last)]
+    stated = smoothed.joint_covariance(last)
+    predicted = state.error.propagated(link, window.chain.gravity, window.tilt, *ends)
+    idle = first | failed | ~measured.mask
+    information = jnp.where(idle, 0.0, measured.information)
+    missed, _ = log_and_jacobian(prediction.T_world_imu.inverse() @ measured.T_world_imu)
+    # the map keeps its error where the window begins anew
+    anew = dataclasses.replace(LatestError.of(stated), map=predicted.map)
+    error = unless(failed, anew, predicted.matched(stated, information))
+    return unless(first, state.error, error), predicted.innovation(missed, information)
+
+
+def _measurements(
     config: LioSamConfig,
     params: LioSamParams,
     state: LioSamState,
@@ -309,20 +354,53 @@ def _appended(
     points: FeaturePoints,
     imu: ImuBatch,
     match: MapMatch,
-) -> tuple[Window, Smoothed]:
-    """Return the window with the state at the scan's end, smoothed; arguments as of :func:`smooth`."""
+) -> tuple[Preintegrated, PoseMeasurement]:
+    """Return the samples up to the scan's end and the matched pose; arguments as of :func:`smooth`."""
     intervals = sample_intervals(imu, state.nav.time_offset, clock.end - clock.interval, clock.end)
     latest = state.window.latest()
     link = preintegrate_parallel(intervals, latest.gyro_bias, latest.accel_bias, params.imu)
     measured = match_as_measurement(
         config, params, match.T_world_imu, match.registration, _arm_squared(points), match.used
     )
-    return append_and_update(
-        state.window,
-        Added(link, measured),
-        max_iterations=config.lio_sam.smoother_iterations,
-        tolerance=params.smoother.tolerance,
+    return link, measured
+
+
+def in_the_map(
+    config: LioSamConfig,
+    params: LioSamParams,
+    state: LioSamState,
+    nav: NavState,
+    points: FeaturePoints,
+    match: MapMatch,
+    smoothing: Smoothing,
+    added: "Addition",
+) -> LatestError:
+    """Return the covariance of the latest state's error after the scan was added to the map.
+
+    Args:
+        config: ``config.lio_sam.lidar_noise``.
+        params: ``params.registration``.
+        state: after the scan before.
+        nav: at the scan's end.
+        points: compensated features.
+        match: the scan's.
+        smoothing: of the match.
+        added: what was added to the map.
+    """
+    dtype = nav.velocity.dtype
+    new = sum(
+        jnp.sum(one.added[: len(mask)])
+        for one, mask in ((added.corner, points.corner_mask), (added.surface, points.surface_mask))
     )
+    share = (new / jnp.maximum(jnp.sum(points.together()[1]), 1)).astype(dtype)
+    # the first scan defines the world, and all planes that the second one meets are new
+    share = jnp.where(match.new_piece, 1.0, jnp.where(state.scans == 0, 0.0, share))
+    renewed = jnp.where(state.scans == 1, 1.0, share)
+    axes = jax.scipy.linalg.block_diag(*[rotation_matrix(lidar_pose(nav).rotation())] * 2)
+    information = params.registration.information_scale * match.registration.information
+    information = jnp.where(match.used, axes @ information @ axes.T, 0.0)
+    planes = error_by_planes(information, _arm_squared(points), nav, jnp.asarray(_PLANE_SHARE, dtype))
+    return smoothing.error.added(share, renewed, planes)
 
 
 class Addition(eqx.Module):
@@ -385,6 +463,7 @@ def as_nav(nav: NavState, window: Window) -> NavState:
         velocity=latest.velocity,
         gyro_bias=latest.gyro_bias,
         accel_bias=latest.accel_bias,
+        gravity=window.gravity(),
     )
 
 

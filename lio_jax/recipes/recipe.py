@@ -291,8 +291,10 @@ class Recipe(ABC, Generic[C, P, S]):
     near_values: ClassVar[Mapping[str, float]] = {}
     """Values by path that replace the defaults where a recording's surroundings are near, m; none: the recipe
     has one set of values for all surroundings."""
-    noise_from_recording: ClassVar[bool] = False
-    """Whether the white noise of the inertial sensor is taken from each recording, where it is not given."""
+    inertial_noise_from_recording: ClassVar[bool] = False
+    """The white noise of the inertial sensor is found in the recording where it is not given."""
+    range_noise_from_recording: ClassVar[bool] = False
+    """The noise of the ranges is found in the recording where it is not given."""
     longest_bridged_gap: ClassVar[float] = 0.0
     """Longest gap between inertial samples, s, that the line between its ends bridges. In a longer one the
     recipe is without samples. A recipe that carries rate and velocity on by itself does better without."""

@@ -1,16 +1,30 @@
 """LIO-SAM's IMU odometry: a window of states with preintegrated samples between them, and limits of matched
 poses."""
 
+import dataclasses
+
+import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from lio_jax.core.error_state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
+from lio_jax.core.error_state import (
+    ACCEL_BIAS,
+    GRAVITY,
+    GYRO_BIAS,
+    POSITION,
+    ROTATION,
+    VELOCITY,
+    NavEstimate,
+    sphere_basis,
+)
+from lio_jax.core.error_state import DOF as NAV_DOF
 from lio_jax.core.geometry import adjoint, from_blocks, rotation_matrix
 from lio_jax.core.types import ImuBatch, NavState
 from lio_jax.estimation.factors import PoseMeasurement, fixed_information
 from lio_jax.estimation.marginal_prior import gaussian_prior
 from lio_jax.estimation.motion_state import DOF, POSE_DOF, MotionState
+from lio_jax.estimation.pose_logarithm import right_jacobian
 from lio_jax.estimation.pose_measurement import keep_observed
 from lio_jax.estimation.sliding_window import Added, Window, open_window, still_link
 from lio_jax.recipes.lio_sam_params import LioSamConfig, LioSamParams, SmootherParams
@@ -72,30 +86,22 @@ def measured_attitude(
     return jaxlie.SO3(wxyz).normalize(), there
 
 
-def opened(
-    config: LioSamConfig, params: LioSamParams, nav: NavState, position_sigma: Float[Array, ""] | None = None
-) -> Window:
-    """Return the window with one state, around which ``params.initial`` says how far the truth may lie.
+_UNKNOWNS = GRAVITY.stop
+"""Number of unknowns of the latest state: its own, and the direction of gravity."""
+_LEAST_SIGMA = 1e-6
+"""Standard deviation of a frozen part of the state, in its own unit: it hardly moves."""
+
+
+def opened(config: LioSamConfig, params: LioSamParams, start: NavEstimate) -> Window:
+    """Return the window with one state, and with the direction of gravity as an unknown.
 
     Args:
         config: ``config.lio_sam.window``.
-        params: ``params.initial`` and ``params.smoother``.
-        nav: the state.
-        position_sigma: m; None: that of ``params.smoother``, as the first position defines the world.
+        params: ``params.smoother``.
+        start: the state and its covariance; its gravity is that without a tilt.
     """
-    initial, smoother = params.initial, params.smoother
-    identity = jnp.eye(3, dtype=nav.velocity.dtype)
-    sigmas = (
-        (ROTATION, initial.rotation_sigma),
-        (POSITION, smoother.position_sigma if position_sigma is None else position_sigma),
-        (VELOCITY, initial.velocity_sigma),
-        (GYRO_BIAS, initial.gyro_bias_sigma),
-        (ACCEL_BIAS, initial.accel_bias_sigma),
-    )
-    # a frozen part of the state is one that hardly moves
-    blocks = ((part, part, jnp.maximum(sigma, 1e-6) ** 2 * identity) for part, sigma in sigmas)
-    covariance = from_blocks((DOF, DOF), *blocks)
-    prior = gaussian_prior(MotionState.of(nav), covariance)
+    nav, smoother = start.nav, params.smoother
+    prior = gaussian_prior(MotionState.of(nav), unknowns_covariance(start))
     unmatched = PoseMeasurement(
         nav.T_world_imu,
         fixed_information(smoother.rotation_sigma, smoother.translation_sigma),
@@ -104,6 +110,57 @@ def opened(
     )
     first = Added(still_link(nav.velocity.dtype), unmatched)
     return open_window(config.lio_sam.window, prior, nav.gravity, first)
+
+
+def unknowns_covariance(start: NavEstimate) -> Float[Array, "17 17"]:
+    """Return the covariance of the window's unknowns: the first state, and the tilt of gravity."""
+    least = _LEAST_SIGMA**2 * jnp.eye(_UNKNOWNS, dtype=start.covariance.dtype)
+    return start.covariance[:_UNKNOWNS, :_UNKNOWNS] + least
+
+
+def opened_anew(config: LioSamConfig, params: LioSamParams, nav: NavState, window: Window) -> Window:
+    """Return the window with one state after a failure, around which the truth may lie anywhere near.
+
+    Args:
+        config: ``config.lio_sam.window``.
+        params: ``params.initial`` and ``params.smoother``.
+        nav: the state.
+        window: before the failure: the tilt of gravity that it found is where the search begins.
+    """
+    initial, smoother = params.initial, params.smoother
+    sigmas = (
+        (ROTATION, smoother.rotation_sigma),
+        (POSITION, smoother.degenerate_sigma),
+        (VELOCITY, initial.velocity_sigma),
+        (GYRO_BIAS, initial.gyro_bias_sigma),
+        (ACCEL_BIAS, initial.accel_bias_sigma),
+        (GRAVITY, initial.gravity_sigma),
+    )
+    dtype = nav.velocity.dtype
+    blocks = ((part, part, sigma**2 * jnp.eye(part.stop - part.start, dtype=dtype)) for part, sigma in sigmas)
+    vertical = dataclasses.replace(nav, gravity=window.chain.gravity)
+    fresh = opened(config, params, NavEstimate(vertical, from_blocks((NAV_DOF, NAV_DOF), *blocks)))
+    places = lambda some: (some.tilt, some.chain.prior.tilt)  # noqa: E731
+    return eqx.tree_at(places, fresh, (window.tilt, window.tilt))
+
+
+def nav_covariance(error: Float[Array, "p p"], window: Window) -> Float[Array, "24 24"]:
+    """Return the covariance of a window's latest state at its place in the navigation state's error.
+
+    Args:
+        error: covariance of the errors of the latest state and of the tilt.
+        window: the window.
+    """
+    vertical, tilt = window.chain.gravity, window.tilt
+    basis = sphere_basis(vertical)
+    # the error of the direction is about axes normal to gravity as it is found
+    turned = sphere_basis(window.gravity()).T @ right_jacobian(-basis @ tilt)[0] @ basis
+    placed = from_blocks(
+        (NAV_DOF, _UNKNOWNS),
+        (slice(0, DOF), slice(0, DOF), jnp.eye(DOF, dtype=turned.dtype)),
+        (GRAVITY, GRAVITY, turned),
+    )
+    return placed @ error @ placed.T
 
 
 def match_as_measurement(

@@ -233,7 +233,7 @@ def with_first_velocity(params: Any, velocity: NDArray[np.float64] | None) -> An
     if velocity is None:
         return params
     if isinstance(params, Dual):
-        return Dual(with_first_velocity(params.value, velocity), params.dot)
+        return push_forward(lambda value: with_first_velocity(value, velocity), params)
     leaf = params.initial.velocity
     shown = jnp.broadcast_to(jnp.asarray(velocity, leaf.dtype), leaf.shape)
     params = eqx.tree_at(lambda one: one.initial.velocity, params, shown)

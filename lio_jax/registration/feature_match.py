@@ -80,6 +80,10 @@ class ScanToFeatures(FeatureMatch):
             fitted_to(self.map.surface, found.planes, frames.surface.anchor, sizes.voxel_size),
         )
 
+    def least_width(self) -> Float[Array, ""] | float:
+        """Return the least width of the points that a plane is fitted to, m."""
+        return 0.0
+
     def searched(self, placed: Float[Array, "k 3"], frame: Frame) -> Bool[Array, " k"]:
         """Return which points, in m from the frame's origin, are matched at all."""
         return jnp.ones(len(placed), bool)
@@ -107,6 +111,7 @@ class ScanToFeatures(FeatureMatch):
                 sizes.voxel_size,
                 self.knn,
                 self.neighbours,
+                self.least_width(),
             ),
         )
 
@@ -127,3 +132,6 @@ class ScanToSubmap(ScanToFeatures):
 
     def weights(self) -> Weights:
         return scored(self.knn)
+
+    def least_width(self) -> Float[Array, ""]:
+        return self.knn.least_width * self.map_params.voxel_size

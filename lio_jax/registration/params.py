@@ -100,15 +100,15 @@ class ScoredFitParams(KnnParams):
 
 
 class ScoredPlaneFitParams(ScoredFitParams):
-    """Planes with scores, as FAST-LIO2 has them."""
+    """Planes with scores, as FAST-LIO2 and LIO-SAM have them."""
 
     least_width: Scalar = leaf(0.4, least=0)
     """Neighbours whose second largest standard deviation is below this share of the map's voxel size lie on a
-    line, such as a sensor's ring on the ground, and define no plane. 0 with FAST-LIO2 itself, and without
-    inertial samples."""
+    line, such as a sensor's ring on the ground, and define no plane. 0 with FAST-LIO2 and LIO-SAM themselves,
+    and without inertial samples."""
 
 
-class ScoredLineFitParams(LineFitParams, ScoredFitParams):
+class ScoredLineFitParams(LineFitParams, ScoredPlaneFitParams):
     """Lines and planes with scores, as LIO-SAM has them."""
 
 

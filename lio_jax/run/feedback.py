@@ -138,17 +138,18 @@ class Feedback:
 def _places(nav: Any, output: Output) -> tuple[Any, ...]:
     """Return what differs between two frames with the same vertical."""
     T_world_lidar = output.registration.T_world_lidar
-    return nav.T_world_imu, nav.velocity, T_world_lidar, output.origin, output.points
+    return nav.T_world_imu, nav.velocity, nav.gravity, T_world_lidar, output.origin, output.points
 
 
 @jax.jit
 def _in_frame(T_new_old: jaxlie.SE3, places: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return :func:`_places` in another frame; points are turned only: they count from the origin."""
-    T_world_imu, velocity, T_world_lidar, origin, points = places
+    T_world_imu, velocity, gravity, T_world_lidar, origin, points = places
     turn = rotation_matrix(T_new_old.rotation())
     return (
         T_new_old @ T_world_imu,
         turn @ velocity,
+        turn @ gravity,
         T_new_old @ T_world_lidar,
         T_new_old @ origin,
         points @ turn.T.astype(points.dtype),

@@ -75,7 +75,7 @@ def with_inertial_noise(sequence: Sequence, settings: Settings) -> tuple[Setting
     the recording shows more noise, which is vibration, or where its samples are too few or too slow.
     """
     free = [path for path in _NOISE if path not in settings.given]
-    if not recipe_named(settings.recipe).noise_from_recording or not uses_imu(settings) or not free:
+    if not recipe_named(settings.recipe).inertial_noise_from_recording or not uses_imu(settings) or not free:
         return settings, []
     recorded = sequence.imu()
     if recorded is None or not len(recorded.stamp_ns):
@@ -112,7 +112,7 @@ def with_given_noise(settings: Settings, gyro_noise: float, accel_noise: float) 
         gyro_noise: rad/s/sqrt(Hz).
         accel_noise: m/s^2/sqrt(Hz).
     """
-    if not recipe_named(settings.recipe).noise_from_recording:
+    if not recipe_named(settings.recipe).inertial_noise_from_recording:
         return settings
     for path, noise in zip(_NOISE, (gyro_noise, accel_noise), strict=True):
         _, section, name = path.split(".")
@@ -141,7 +141,7 @@ def with_range_noise(settings: Settings, scans: Iterable[LidarScan]) -> tuple[Se
         scans: scans of the recording; the first ones with rings decide, mostly the first one alone.
     """
     recipe, lidar = recipe_named(settings.recipe), settings.params().lidar
-    if not recipe.noise_from_recording or not uses_imu(settings) or _RANGE in settings.given:
+    if not recipe.range_noise_from_recording or not uses_imu(settings) or _RANGE in settings.given:
         return settings, []
     with_rings = (scan for scan in islice(scans, _SCANS_WITH_RINGS) if (scan.ring >= 0).any())
     # one by one: a recording that breaks off early is read no further than needed

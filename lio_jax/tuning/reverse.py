@@ -213,9 +213,7 @@ class _Tape:
             first, found = given
             none = jax.tree.map(jnp.zeros_like, self._params[0])
             return none, _pull_velocity(self._through_map, first, found, bar), sums_bar
-        tuned, others = self._params
-        others = with_first_velocity(others, operation.velocity)
-        return self._pull_init((tuned, others), operation.imu, bar), (), sums_bar
+        return self._pull_init(self._params, operation.imu, operation.velocity, bar), (), sums_bar
 
 
 def _pull_params(free: ParameterVector, x: Array, bar: Params) -> Array:
@@ -227,12 +225,14 @@ def _pull_init(
     through_map: bool,
     params: tuple[Params, Params],
     imu: ImuBatch | None,
+    velocity: NDArray[np.float64] | None,
     bar: Any,
 ) -> Params:
     tuned, others = params
 
     def init(tuned: Params) -> Any:
-        return split_smooth(recipe.init(eqx.combine(tuned, others), imu), through_map)[0]
+        begun = with_first_velocity(eqx.combine(tuned, others), velocity)
+        return split_smooth(recipe.init(begun, imu), through_map)[0]
 
     return jax.vjp(init, tuned)[1](bar)[0]
 

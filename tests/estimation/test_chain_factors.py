@@ -67,7 +67,7 @@ def factors():
     position = PositionMeasurement(jnp.ones(3), jnp.array([0.5, 0.6, 0.7]), jnp.ones(3), kernel, there)
     return {
         "imu": (motion, (a, b), 15),
-        "prior": (prior.quadratic, (b,), 15),
+        "prior": (lambda state: prior.quadratic(state, jnp.zeros(0)), (b,), 15),
         "pose": (pose.quadratic, (b,), 6),
         "relative": (relative.quadratic, (a, b), 6),
         "position": (position.quadratic, (a,), 6),

@@ -95,7 +95,7 @@ CORRECT = PerShape(jax.jit(LioSam(CONFIG).corrected))
 )
 def test_a_rigid_correction_moves_the_next_scans_rigidly(drive, yaw, position, most_turned, most_moved):
     inputs, _ = arrays()
-    states, _, poses = drive
+    states, outputs, poses = drive
     last = SCANS - 3
     T = jaxlie.SE3.from_rotation_and_translation(
         jaxlie.SO3.from_z_radians(jnp.asarray(yaw)), jnp.asarray(position)
@@ -111,12 +111,20 @@ def test_a_rigid_correction_moves_the_next_scans_rigidly(drive, yaw, position, m
         assert not output.lost
         assert Rotation.from_matrix(apart[:3, :3]).magnitude() < most_turned
         assert np.linalg.norm(apart[:3, 3]) < most_moved
-        np.testing.assert_allclose(state.nav.gyro_bias, states[number].nav.gyro_bias, atol=1e-5)
-        np.testing.assert_allclose(state.nav.accel_bias, states[number].nav.accel_bias, atol=1e-4)
+        sigma = np.sqrt(np.diagonal(outputs[number].covariance))
+        # three scans tell little of the biases: maps of the same points leave them within a tenth of a sigma
+        share = 0.1 if most_moved < 0.01 else 1.0
+        for name, part in (("gyro_bias", GYRO_BIAS), ("accel_bias", ACCEL_BIAS)):
+            apart = getattr(state.nav, name) - getattr(states[number].nav, name)
+            assert (np.abs(apart) < share * sigma[part]).all()
 
 
 def speed_at(number: int) -> float:
-    return float(np.linalg.norm(truth()[number, :3, 3] - truth()[number - 1, :3, 3]) / 0.1)
+    """Return the speed at a scan's end: the vehicle accelerates, so that it is above the interval's mean."""
+    last, before = (
+        np.linalg.norm(truth()[k, :3, 3] - truth()[k - 1, :3, 3]) / 0.1 for k in (number, number - 1)
+    )
+    return float(last + (last - before) / 2)
 
 
 def test_a_drive_is_tracked(drive):
@@ -253,15 +261,15 @@ def test_a_runaway_bias_starts_the_smoother_anew():
 
 
 @pytest.mark.long
-def test_information_in_place_of_fixed_sigmas():
-    chosen = settings_with("config.lio_sam.lidar_noise=information")
+def test_fixed_sigmas_in_place_of_information():
+    chosen = settings_with("config.lio_sam.lidar_noise=fixed")
     step = PerShape(jax.jit(LioSam(chosen.config).step))
     inputs, before = arrays()
     state, params = INIT(chosen.params(), before), chosen.params()
     for number in range(MOVING):
-        state, output = step(params, state, *inputs[number])
-    fixed = run(count=MOVING)[1][-1].covariance
-    assert np.sqrt(output.covariance[3, 3]) < 0.5 * np.sqrt(fixed[3, 3])
+        state, fixed = step(params, state, *inputs[number])
+    by_information = run(count=MOVING)[1][-1].covariance
+    assert np.sqrt(by_information[3, 3]) < 0.5 * np.sqrt(fixed.covariance[3, 3])
 
 
 @pytest.mark.parametrize("weak", [0, 1])

@@ -1,11 +1,17 @@
 """Every recipe finds its velocity from the first scans, at any speed."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lio_jax.core.types import ImuBatch
 from lio_jax.data.detect import open_sequence
+from lio_jax.recipes.transforms import split_smooth, with_first_velocity
 from lio_jax.run.track import scan_inputs
-from lio_jax.settings.settings import Settings, with_overrides
+from lio_jax.settings.settings import Settings, recipe_of, with_overrides
+from lio_jax.tuning.parameters import free_parameters
+from lio_jax.tuning.reverse import _pull_init
 from tests.run.roads import relative, road, steps, tracked
 from tests.shared_data import SHARED_DATA, needs_shared
 
@@ -67,3 +73,21 @@ def test_the_state_of_the_first_scan_has_the_velocity_that_the_second_one_shows(
     sequence = road("street", 25.0, 0.0, 8)
     _, results = tracked(sequence, "default")
     assert np.linalg.norm(results[0].nav.velocity) == pytest.approx(25.0, rel=0.05)
+
+
+@pytest.mark.parametrize(("sigma", "slope"), [(10.0, 0.0), (0.2, 0.2)])
+def test_the_derivative_knows_which_sigma_of_the_first_velocity_holds(sigma, slope):
+    """What two scans show is as sure as 0.3 m/s, unless the settings are surer; the parameter is a log."""
+    settings = with_overrides(Settings(), [f"params.initial.velocity_sigma={sigma}"])
+    free = free_parameters(settings.params(), ["initial.velocity_sigma"])
+    shown = np.array([3.0, 0.0, 0.0])
+    forward = with_first_velocity(free.with_tangents(free.first()), shown)
+    np.testing.assert_array_equal(forward.value.initial.velocity, shown)
+    assert forward.value.initial.velocity_sigma == pytest.approx(min(sigma, 0.3))
+    np.testing.assert_allclose(forward.dot.initial.velocity_sigma, [slope], rtol=1e-6)
+    recipe, split = recipe_of(settings), free.split(settings.params())
+    still = jnp.tile(jnp.array([0.0, 0.0, 9.81]), (20, 1))
+    imu = ImuBatch(jnp.linspace(-0.1, 0.0, 20), jnp.zeros((20, 3)), still, jnp.ones(20, bool))
+    bar = jax.tree.map(jnp.ones_like, split_smooth(recipe.init(settings.params(), imu), False)[0])
+    pulled = _pull_init(recipe, False, split, imu, shown, bar)
+    assert (pulled.initial.velocity_sigma != 0) == (slope != 0)

@@ -31,8 +31,8 @@ NOISE = 2e-10
 """Noise as a share of a total: solves end at a step of 1e-12 and not of 0."""
 SMOOTHER_STEPS = {
     **STEPS,
-    "imu.gyro_noise": 1e-2,
-    "imu.accel_noise": 1e-2,
+    "imu.gyro_noise": 3e-3,
+    "imu.accel_noise": 3e-3,
     "imu.gyro_bias_walk": 1e-2,
     "imu.accel_bias_walk": 1e-2,
     "imu.gravity": 1e-5,
@@ -135,8 +135,10 @@ def differentiable(recipe: Recipe) -> list[str]:
 
 def check_gradients(recipe: str, inertial: bool) -> None:
     """Gradients of every leaf agree with central differences."""
-    chosen = settings(recipe, inertial, *TIGHT)
-    recording = DoubleRecording(drive(), chosen)
+    # the features of a coarser scan leave a direction open, and the derivative holds it constant
+    driven = drive(columns=512 if recipe == "lio_sam" else 256)
+    chosen = settings(recipe, inertial, *TIGHT, of=driven)
+    recording = DoubleRecording(driven, chosen)
     free = free_parameters(chosen.params(), differentiable(recipe_of(chosen)))
     assert set(free.paths) == set(differentiable(recipe_of(chosen)))
     x = np.asarray(free.first())
@@ -149,12 +151,15 @@ def check_gradients(recipe: str, inertial: bool) -> None:
     steps, noise = (SMOOTHER_STEPS, SMOOTHER_NOISE) if recipe == "lio_sam" else (STEPS, NOISE)
     # a total's rounding grows with it
     noise *= max(1.0, abs(result.value))
+    wrong = {}
     for component, (name, declared) in enumerate(zip(free.names, free.declared, strict=True)):
         step = steps.get(name, steps["where points lie" if declared.moves_points else ""])
         ends = [x + sign * step * (np.arange(len(x)) == component) for sign in (1, -1)]
         high, low = (total(HeldMap(chosen, free(end), nominal), recording) for end in ends)
         difference = (high - low) / (2 * step)
-        assert result.gradient[component] == pytest.approx(difference, rel=1e-4, abs=noise / step), name
+        if result.gradient[component] != pytest.approx(difference, rel=1e-4, abs=noise / step):
+            wrong[name] = result.gradient[component], difference
+    assert not wrong
 
 
 @pytest.mark.long
@@ -170,8 +175,7 @@ def test_the_marginal_likelihood_has_a_derivative_by_every_leaf():
     # loose matches of half a second tell little of the samples' noise
     assert by_name["imu.gyro_noise"] != 0
     assert by_name["imu.accel_noise"] != 0
-    assert abs(by_name["smoother.rotation_sigma"]) > 1e-3
-    assert abs(by_name["smoother.translation_sigma"]) > 1e-3
+    assert abs(by_name["registration.information_scale"]) > 1e-3
     # the recipe does not read it
     assert "lidar.angle_sigma" not in by_name
 
