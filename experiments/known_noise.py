@@ -30,24 +30,13 @@ class Tuning:
 
     free: tuple[str, ...]
     objective: str
-    overrides: tuple[str, ...] = ()
-    """Settings that the recordings need."""
 
 
 TUNINGS = {
     "default": Tuning((*TRUE, "registration.information_scale"), "noise"),
-    "lio_sam": Tuning(
-        ("imu.*_noise", "imu.*_walk", "smoother.rotation_sigma", "smoother.translation_sigma"),
-        "marginal",
-        # the sensor's first biases are 20 times what LIO-SAM expects; gravity differs from LIO-SAM's value
-        (
-            "params.initial.gyro_bias_sigma=0.01",
-            "params.initial.accel_bias_sigma=0.1",
-            "params.imu.gravity=9.80665",
-        ),
-    ),
+    "lio_sam": Tuning(("imu.*_noise", "imu.*_walk", "registration.information_scale"), "marginal"),
 }
-"""Tunings by recipe. The true sigmas of a scan match are not known, so they are tuned as well."""
+"""Tunings by recipe. The true noise of a scan match is not known, so its scale is tuned as well."""
 
 
 @dataclass(frozen=True)
@@ -194,10 +183,9 @@ class Workshop:
 
     def _settings(self, sequence: Any) -> Any:
         from lio_jax.run.run import settings_for
-        from lio_jax.settings.settings import recipe_settings, with_overrides
+        from lio_jax.settings.settings import recipe_settings
 
-        chosen = with_overrides(recipe_settings(self._recipe), list(TUNINGS[self._recipe].overrides))
-        return settings_for(sequence, chosen)[0]
+        return settings_for(sequence, recipe_settings(self._recipe))[0]
 
 
 def _at(arrays: dict[str, Any], name: str, stamp_ns: int) -> np.ndarray:

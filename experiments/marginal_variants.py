@@ -122,7 +122,8 @@ def gathered(shop: Workshop, world: str, seed: int) -> tuple[Sweep, jaxlie.SE3, 
             intervals = cut(fed.imu, state.nav.time_offset, *jnp.asarray(span))
             sweeps.append(Sweep(intervals, latest, jnp.asarray(span)))
         latest = jax.tree.map(np.asarray, state.window.latest())
-        matched.append(np.asarray(state.nav.T_world_imu.wxyz_xyz))
+        window = state.window.chain
+        matched.append(np.asarray(window.lidar.T_world_imu.wxyz_xyz[window.count - 1]))
         true.append(np.asarray(truth.T_world_imu.wxyz_xyz))
     stacked = jax.tree.map(lambda *rows: jnp.stack([jnp.asarray(row) for row in rows]), *sweeps)
     return stacked, jaxlie.SE3(jnp.asarray(matched)), jaxlie.SE3(jnp.asarray(true))
