@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from lio_jax.core.types import ImuBatch, Scan
@@ -223,12 +224,12 @@ def reopened(
     return stepper.step(opened, first.scan, first.imu)
 
 
-def with_first_velocity(params: Any, velocity: NDArray[np.float64] | None) -> Any:
+def with_first_velocity(params: Any, velocity: Float[Array | np.ndarray, "3"] | None) -> Any:
     """Return params, or those of a transformed recipe, that start with a velocity that two scans show.
 
     Args:
         params: a recipe's, those of a batch, or a :class:`Dual`.
-        velocity: (3,) m/s along the IMU's axes; None: the params stay.
+        velocity: m/s along the IMU's axes; None: the params stay.
     """
     if velocity is None:
         return params

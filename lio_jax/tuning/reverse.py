@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from lio_jax.core.types import ImuBatch, Scan
@@ -225,7 +225,7 @@ def _pull_init(
     through_map: bool,
     params: tuple[Params, Params],
     imu: ImuBatch | None,
-    velocity: NDArray[np.float64] | None,
+    velocity: Float[Array | np.ndarray, "3"] | None,
     bar: Any,
 ) -> Params:
     tuned, others = params

@@ -1,5 +1,7 @@
 """Every recipe finds its velocity from the first scans, at any speed."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -89,5 +91,5 @@ def test_the_derivative_knows_which_sigma_of_the_first_velocity_holds(sigma, slo
     still = jnp.tile(jnp.array([0.0, 0.0, 9.81]), (20, 1))
     imu = ImuBatch(jnp.linspace(-0.1, 0.0, 20), jnp.zeros((20, 3)), still, jnp.ones(20, bool))
     bar = jax.tree.map(jnp.ones_like, split_smooth(recipe.init(settings.params(), imu), False)[0])
-    pulled = _pull_init(recipe, False, split, imu, shown, bar)
+    pulled = jax.jit(partial(_pull_init, recipe, False))(split, imu, shown, bar)
     assert (pulled.initial.velocity_sigma != 0) == (slope != 0)
