@@ -173,6 +173,26 @@ def imu_quadratic(
         start: state at the first instant.
         end: state at the last instant.
     """
+    residual, jacobian = residual_with_tilt(measured, gravity, tilt, start, end)
+    return quadratic(residual, jacobian, information, jnp.ones((), residual.dtype))
+
+
+def residual_with_tilt(
+    measured: Preintegrated,
+    gravity: Float[Array, "3"],
+    tilt: Float[Array, " q"],
+    start: MotionState,
+    end: MotionState,
+) -> tuple[Float[Array, "15"], Float[Array, "15 p"]]:
+    """Return :func:`imu_residual`, and its Jacobian by the errors of both states and of the tilt, p = 30 + q.
+
+    Args:
+        measured: preintegrated from ``start`` to ``end``.
+        gravity: m/s^2, in world, without the tilt.
+        tilt: of gravity, rad; q is 0 where its direction is known.
+        start: state at the first instant.
+        end: state at the last instant.
+    """
     residual, jacobian = imu_residual(measured, tilted(gravity, tilt), start, end)
     fall = rotation_matrix(end.T_world_imu.rotation()).T @ by_tilt(gravity, tilt)
     elapsed = jnp.where(measured.measured, measured.duration, 0.0)
@@ -181,8 +201,7 @@ def imu_quadratic(
         (POSITION, slice(0, len(tilt)), elapsed**2 / 2 * fall),
         (VELOCITY, slice(0, len(tilt)), elapsed * fall),
     )
-    jacobian = jnp.concatenate([jacobian, by_fall], axis=1)
-    return quadratic(residual, jacobian, information, jnp.ones((), residual.dtype))
+    return residual, jnp.concatenate([jacobian, by_fall], axis=1)
 
 
 def imu_residual(

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from lio_jax.core.geometry import adjoint
-from lio_jax.estimation.factors import FLOOR, by_tilt, imu_residual, tilted
+from lio_jax.estimation.factors import FLOOR, residual_with_tilt
 from lio_jax.estimation.innovation import Innovation, innovation_of, square_root_information
 from lio_jax.estimation.motion_state import DOF, POSE_DOF, MotionState
 from lio_jax.imu.preintegration import Preintegrated
@@ -61,14 +61,10 @@ class LatestError(eqx.Module):
             start: the state before.
             end: the state.
         """
-        residual, jacobian = imu_residual(link, tilted(gravity, tilt), start, end)
-        elapsed = jnp.where(link.measured, link.duration, 0.0)
-        fall = end.T_world_imu.rotation().as_matrix().T @ by_tilt(gravity, tilt)
-        nothing = jnp.zeros((3, len(tilt)), residual.dtype)
-        by_fall = jnp.concatenate([nothing, elapsed**2 / 2 * fall, elapsed * fall, nothing, nothing])
+        residual, jacobian = residual_with_tilt(link, gravity, tilt, start, end)
+        by_start, by_end, by_fall = jnp.split(jacobian, (DOF, 2 * DOF), axis=1)
         identity = jnp.eye(DOF, dtype=residual.dtype)
-        right = jnp.concatenate([jacobian[:, :DOF], by_fall, identity], axis=1)
-        solved = -jnp.linalg.solve(jacobian[:, DOF:], right)
+        solved = -jnp.linalg.solve(by_end, jnp.concatenate([by_start, by_fall, identity], axis=1))
         size = len(self.state)
         carry = jnp.eye(size, dtype=residual.dtype).at[:DOF].set(solved[:, :size])
         noise = link.covariance + jnp.diag(jnp.asarray(FLOOR, residual.dtype) ** 2)
@@ -104,19 +100,16 @@ class LatestError(eqx.Module):
         state = kept @ self.state @ kept.T + mixed + mixed.T + taken
         return LatestError(_symmetric(state), kept @ self.cross + gain @ self.map, self.map)
 
-    def added(
-        self, share: Float[Array, ""], renewed: Float[Array, ""], by_planes: Float[Array, "6 6"]
-    ) -> "LatestError":
+    def added(self, share: Float[Array, ""], noise: Float[Array, "6 6"]) -> "LatestError":
         """Return the covariance after a scan was added to the map at the state's pose.
 
         Args:
-            share: share of the scan's points that are new to the map, 0 to 1; 1 where a new piece begins.
-            renewed: share of the planes that later scans meet which are new, 0 to 1.
-            by_planes: covariance of the pose's error by the planes of the map.
+            share: share of the scan's points that take the pose's error into the map, 0 to 1.
+            noise: covariance of the new planes' error; both by
+                :func:`~lio_jax.estimation.map_drift.taken_into_map`.
         """
         pose, old = slice(0, POSE_DOF), 1 - share
         across = old * share * self.cross[pose]
-        noise = renewed * (2 - renewed) * by_planes
         in_map = old**2 * self.map + across + across.T + share**2 * self.state[pose, pose] + noise
         cross = old * self.cross + share * self.state[:, pose]
         return LatestError(self.state, cross, _symmetric(in_map))

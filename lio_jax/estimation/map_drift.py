@@ -67,13 +67,10 @@ class MapDrift(eqx.Module):
             within: state at which the scan was added, with the covariance of its error within the map.
             share: share of the scan's points that were new to the map, 0 to 1.
             by_planes: covariance B of the pose's error by the planes of the map.
-            scans: number of earlier scans. The first scan defines the world, so it adds no error. All planes
-                that the second one meets are new.
+            scans: number of earlier scans.
         """
         dtype = within.covariance.dtype
-        share = jnp.where(scans == 0, 0.0, share.astype(dtype))
-        renewed = jnp.where(scans == 1, 1.0, share)
-        noise = renewed * (2 - renewed) * by_planes
+        share, noise = taken_into_map(share.astype(dtype), by_planes, scans)
         # the points lie where the lidar's pose puts them: a wrong extrinsic alone moves none
         by_lidar = lidar_pose_jacobian(within.nav)
         into_map = share * jnp.linalg.solve(by_lidar[:, _POSE], by_lidar)
@@ -109,6 +106,23 @@ class MapDrift(eqx.Module):
         moves = _moves(within.nav)
         shared = self.cross @ moves.T
         return _symmetric(within.covariance + moves @ self.covariance @ moves.T + shared + shared.T)
+
+
+def taken_into_map(
+    share: Float[Array, ""], by_planes: Float[Array, "6 6"], scans: Int32[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, "6 6"]]:
+    """Return the share of the pose's error that the map takes in with a scan, and the covariance of n.
+
+    The first scan defines the world, so it adds no error. All planes that the second one meets are new.
+
+    Args:
+        share: share of the scan's points that were new to the map, 0 to 1.
+        by_planes: covariance B of the pose's error by the planes of the map.
+        scans: number of earlier scans.
+    """
+    share = jnp.where(scans == 0, 0.0, share)
+    renewed = jnp.where(scans == 1, 1.0, share)
+    return share, renewed * (2 - renewed) * by_planes
 
 
 _WEAKEST = 3e-3

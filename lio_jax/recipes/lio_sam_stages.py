@@ -19,7 +19,7 @@ from lio_jax.estimation.chain import information_of, linearise
 from lio_jax.estimation.factors import PoseMeasurement
 from lio_jax.estimation.innovation import Innovation
 from lio_jax.estimation.latest_error import LatestError, unless
-from lio_jax.estimation.map_drift import error_by_planes
+from lio_jax.estimation.map_drift import error_by_planes, taken_into_map
 from lio_jax.estimation.pose_logarithm import log_and_jacobian
 from lio_jax.estimation.sliding_window import Added, Window, append_and_update
 from lio_jax.estimation.smoother import Smoothed
@@ -393,14 +393,12 @@ def in_the_map(
         for one, mask in ((added.corner, points.corner_mask), (added.surface, points.surface_mask))
     )
     share = (new / jnp.maximum(jnp.sum(points.together()[1]), 1)).astype(dtype)
-    # the first scan defines the world, and all planes that the second one meets are new
-    share = jnp.where(match.new_piece, 1.0, jnp.where(state.scans == 0, 0.0, share))
-    renewed = jnp.where(state.scans == 1, 1.0, share)
+    share = jnp.where(match.new_piece, 1.0, share)
     axes = jax.scipy.linalg.block_diag(*[rotation_matrix(lidar_pose(nav).rotation())] * 2)
     information = params.registration.information_scale * match.registration.information
     information = jnp.where(match.used, axes @ information @ axes.T, 0.0)
     planes = error_by_planes(information, _arm_squared(points), nav, jnp.asarray(_PLANE_SHARE, dtype))
-    return smoothing.error.added(share, renewed, planes)
+    return smoothing.error.added(*taken_into_map(share, planes, state.scans))
 
 
 class Addition(eqx.Module):

@@ -13,6 +13,7 @@ from lio_jax.core.types import CONVERGED
 from lio_jax.estimation.chain import information_of, linearise
 from lio_jax.estimation.factors import by_tilt, tilted
 from lio_jax.estimation.latest_error import LatestError
+from lio_jax.estimation.map_drift import taken_into_map
 from lio_jax.estimation.marginal_prior import gaussian_prior
 from lio_jax.estimation.sliding_window import (
     Added,
@@ -150,13 +151,14 @@ def test_another_world_turns_the_tilt():
     np.testing.assert_allclose(np.linalg.norm(after.by_tilt), np.linalg.norm(before.by_tilt), rtol=1e-9)
 
 
-def test_map_and_state_follow_their_recursion():
-    """The joint covariance by plain matrices: match, then insertion."""
+@pytest.mark.parametrize(("scans", "taken", "renewed"), [(0, 0.0, 0.0), (1, 0.3, 1.0), (7, 0.3, 0.3)])
+def test_map_and_state_follow_their_recursion(scans, taken, renewed):
+    """The joint covariance by plain matrices: match, then insertion of a scan of which 0.3 is new."""
     rng = np.random.default_rng(0)
     root = rng.normal(size=(23, 23))
     joint, information = root @ root.T, np.diag(rng.uniform(1, 2, 6))
     window = np.linalg.inv(np.linalg.inv(joint[:17, :17]) + np.pad(information, (0, 11)))
-    planes, share, renewed = np.eye(6), 0.3, 0.5
+    planes = np.eye(6)
     error = LatestError(*map(jnp.asarray, (joint[:17, :17], joint[:17, 17:], joint[17:, 17:])))
     gain = window[:, :6] @ information
     T = np.eye(23)
@@ -165,12 +167,12 @@ def test_map_and_state_follow_their_recursion():
     after = T @ joint @ T.T
     after[:17, :17] += gain @ np.linalg.inv(information) @ gain.T
     J = np.eye(23)
-    J[17:, :6] = share * np.eye(6)
-    J[17:, 17:] *= 1 - share
+    J[17:, :6] = taken * np.eye(6)
+    J[17:, 17:] *= 1 - taken
     after = J @ after @ J.T
     after[17:, 17:] += renewed * (2 - renewed) * planes
     found = error.matched(jnp.asarray(window), jnp.asarray(information))
-    found = found.added(jnp.asarray(share), jnp.asarray(renewed), jnp.asarray(planes))
+    found = found.added(*taken_into_map(jnp.asarray(0.3), jnp.asarray(planes), jnp.int32(scans)))
     np.testing.assert_allclose(found.state, after[:17, :17], atol=1e-9)
     np.testing.assert_allclose(found.cross, after[:17, 17:], atol=1e-9)
     np.testing.assert_allclose(found.map, after[17:, 17:], atol=1e-9)
