@@ -18,6 +18,16 @@ def skew(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
     return jnp.take(vector, _ENTRY, axis=-1, mode="clip") * _SIGN
 
 
+def dot3(left: Float[Array, "*b 3"], right: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
+    """Return the inner products of vectors along the last axis.
+
+    XLA's CPU backend reduces an axis in a kernel of its own, which takes longer than three components that
+    are added in the kernel that uses the result.
+    """
+    x, y, z = (left[..., i] * right[..., i] for i in range(3))
+    return x + y + z
+
+
 @jax.jit
 def rotation_matrix(rotation: jaxlie.SO3) -> Float[Array, "*b 3 3"]:
     """Return the rotation matrix of a quaternion (w, v) of any length above zero.
@@ -49,13 +59,14 @@ def eigenvalues_and_normal3(
         off_diagonal: entries xy, xz and yz.
     """
     tiny = jnp.finfo(diagonal.dtype).tiny
-    mean = jnp.mean(diagonal, -1)
+    mean = (diagonal[..., 0] + diagonal[..., 1] + diagonal[..., 2]) / 3
     # scaled entry by entry, because products of three underflow for nearly coincident points
-    spread = jnp.sum((diagonal - mean[..., None]) ** 2, -1) + 2 * jnp.sum(off_diagonal**2, -1)
+    centred = diagonal - mean[..., None]
+    spread = dot3(centred, centred) + 2 * dot3(off_diagonal, off_diagonal)
     p = jnp.sqrt(jnp.maximum(spread / 6, tiny))
     round_shape = p <= 8 * jnp.finfo(diagonal.dtype).eps * jnp.abs(mean)
     scale = jnp.where(round_shape, 0.0, 1 / p)[..., None]
-    ax, ay, az = jnp.moveaxis((diagonal - mean[..., None]) * scale, -1, 0)
+    ax, ay, az = jnp.moveaxis(centred * scale, -1, 0)
     xy, xz, yz = jnp.moveaxis(off_diagonal * scale, -1, 0)
     determinant = ax * (ay * az - yz**2) - xy * (xy * az - yz * xz) + xz * (xy * yz - ay * xz)
     thin = determinant > 0
@@ -157,9 +168,9 @@ def across(axis: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3"], Float[Arra
 def _longest(*candidates: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
     """Return the longest of the vectors at unit length; (0, 0, 1) where all are zero."""
     best, *others = candidates
-    length = jnp.sum(best**2, -1)
+    length = dot3(best, best)
     for vector in others:
-        squared = jnp.sum(vector**2, -1)
+        squared = dot3(vector, vector)
         best = jnp.where((squared > length)[..., None], vector, best)
         length = jnp.maximum(squared, length)
     zero = length <= jnp.finfo(best.dtype).tiny
@@ -196,6 +207,22 @@ def adjoint(pose: jaxlie.SE3) -> Float[Array, "6 6"]:
     return from_blocks(
         (6, 6), (turn, turn, matrix), (move, move, matrix), (move, turn, skew(pose.translation()) @ matrix)
     )
+
+
+@jax.custom_jvp
+def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Return the inverse of a small matrix, with the derivative -X dA X of X = A^-1.
+
+    JAX's own derivative solves a system with as many right sides as there are tangents. The linear algebra
+    library takes threads for these, and waking them takes longer than the products.
+    """
+    return jnp.linalg.inv(matrix)
+
+
+@inverse.defjvp
+def _inverse_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    found = inverse(*primals)
+    return found, -found @ tangents[0] @ found
 
 
 def covariance_of(information: NDArray[np.float64]) -> NDArray[np.float64]:

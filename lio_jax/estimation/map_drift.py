@@ -27,9 +27,9 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.error_state import DOF, GRAVITY, POSITION, ROTATION, VELOCITY, NavEstimate, sphere_basis
-from lio_jax.core.geometry import adjoint, from_blocks, rotation_matrix, skew
+from lio_jax.core.geometry import adjoint, from_blocks, inverse, rotation_matrix, skew
 from lio_jax.core.types import NavState
-from lio_jax.estimation.pose_measurement import lidar_pose_jacobian
+from lio_jax.estimation.pose_measurement import imu_pose_jacobian, lidar_pose_jacobian
 
 _POSE = slice(ROTATION.start, POSITION.stop)
 
@@ -72,8 +72,7 @@ class MapDrift(eqx.Module):
         dtype = within.covariance.dtype
         share, noise = taken_into_map(share.astype(dtype), by_planes, scans)
         # the points lie where the lidar's pose puts them: a wrong extrinsic alone moves none
-        by_lidar = lidar_pose_jacobian(within.nav)
-        into_map = share * jnp.linalg.solve(by_lidar[:, _POSE], by_lidar)
+        into_map = share * imu_pose_jacobian(within.nav)
         kept = jnp.eye(DOF, dtype=dtype) - _moves(within.nav) @ into_map
         covariance, both = within.covariance, into_map @ self.cross
         drift = MapDrift(
@@ -155,7 +154,7 @@ def error_by_planes(
     matched = weakest > 0
     by_imu = lidar_pose_jacobian(nav)[:, _POSE]
     whole = by_imu.T @ (information + jnp.diag(weakest / to_metres**2)) @ by_imu
-    found = share * jnp.linalg.inv(jnp.where(matched, whole, jnp.eye(6, dtype=dtype)))
+    found = share * inverse(jnp.where(matched, whole, jnp.eye(6, dtype=dtype)))
     return jnp.where(matched, _symmetric(found), 0.0)
 
 

@@ -37,6 +37,29 @@ def lidar_pose_jacobian(nav: NavState) -> Float[Array, "6 24"]:
     )
 
 
+def imu_pose_jacobian(nav: NavState) -> Float[Array, "6 24"]:
+    """Return the error of the IMU's pose that moves the lidar as the error at ``nav`` does.
+
+    With J of :func:`lidar_pose_jacobian` and J_pose its columns of rotation and position it is J_pose^-1 J:
+    an error of the extrinsic alone moves the lidar, too. The rows are a right perturbation, rotation (rad)
+    before translation (m).
+
+    Args:
+        nav: state at which to linearise.
+    """
+    R_imu_lidar = rotation_matrix(nav.T_imu_lidar.rotation())
+    identity = jnp.eye(3, dtype=R_imu_lidar.dtype)
+    turn, move = slice(0, 3), slice(3, 6)
+    return from_blocks(
+        (6, DOF),
+        (turn, ROTATION, identity),
+        (move, POSITION, identity),
+        (turn, EXTRINSIC_ROTATION, R_imu_lidar),
+        (move, EXTRINSIC_ROTATION, skew(nav.T_imu_lidar.translation()) @ R_imu_lidar),
+        (move, EXTRINSIC_TRANSLATION, identity),
+    )
+
+
 def keep_observed(
     information: Float[Array, "6 6"],
     gradient: Float[Array, "6"],

@@ -1,6 +1,7 @@
 """Discrete noise from continuous-time densities, and the covariance that it adds over many intervals."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -81,13 +82,49 @@ def process_noise(
     Returns:
         The covariance of the results, the gyroscope's bias and the accelerometer's bias, in this order.
     """
+    columns, weights = _columns(inputs, measured), _weights(noise)
+    return _flat(columns * weights) @ _flat(columns).T
+
+
+def process_noise_slopes(
+    inputs: Float[Array, "n r 6"],
+    inputs_slopes: Float[Array, "d n r 6"],
+    noise: IntervalNoise,
+    noise_slopes: IntervalNoise,
+    measured: Bool[Array, ""] | bool = True,
+) -> tuple[Float[Array, "d r+6 r+6"], Float[Array, "p r+6 r+6"]]:
+    """Return the derivatives of :func:`process_noise` along directions of the inputs, and of the variances.
+
+    Args:
+        inputs: as in :func:`process_noise`.
+        inputs_slopes: derivative of the inputs along each of d directions.
+        noise: as in :func:`process_noise`.
+        noise_slopes: derivative of the variances along each of p directions, as leaves of (p, n).
+        measured: as in :func:`process_noise`.
+    """
+    columns, weights = _columns(inputs, measured), _weights(noise)
+
+    def along(inputs_slope: Array) -> Array:
+        moved = jax.jvp(lambda inputs: _columns(inputs, measured), (inputs,), (inputs_slope,))[1]
+        half = _flat(moved) @ _flat(columns * weights).T
+        return half + half.T
+
+    by_noise = jax.vmap(lambda slope: _flat(columns * _weights(slope)) @ _flat(columns).T)
+    return jax.vmap(along)(inputs_slopes), by_noise(noise_slopes)
+
+
+def _columns(inputs: Float[Array, "n r 6"], measured: Bool[Array, ""] | bool) -> Float[Array, "r+6 n 12"]:
+    """Return the derivative of results and biases with respect to each interval's twelve errors."""
     later = jnp.where(measured, prefix_sum(inputs) - jnp.sum(inputs, axis=0), 0.0)
-    unit = jnp.broadcast_to(jnp.eye(6, dtype=inputs.dtype), (len(inputs), 6, 6))
-    none = jnp.zeros_like(unit)
-    columns = jnp.concatenate(
-        [jnp.concatenate([inputs, none], axis=1), jnp.concatenate([later, unit], axis=1)], axis=2
-    )
+    results = jnp.swapaxes(jnp.concatenate([inputs, later], axis=2), 0, 1)
+    unit = jnp.eye(6, 12, k=6, dtype=inputs.dtype)
+    return jnp.concatenate([results, jnp.broadcast_to(unit[:, None], (6, len(inputs), 12))])
+
+
+def _weights(noise: IntervalNoise) -> Float[Array, "n 12"]:
     variances = jnp.stack([noise.gyro, noise.accel, noise.gyro_bias, noise.accel_bias], axis=1)
-    weighted = columns * jnp.repeat(variances, 3, axis=1)[:, None]
-    flat = (-1, inputs.shape[1] + 6)
-    return jnp.swapaxes(weighted, 1, 2).reshape(flat).T @ jnp.swapaxes(columns, 1, 2).reshape(flat)
+    return jnp.repeat(variances, 3, axis=1)
+
+
+def _flat(columns: Float[Array, "r n 12"]) -> Float[Array, "r n*12"]:
+    return columns.reshape(len(columns), -1)

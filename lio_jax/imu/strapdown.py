@@ -2,13 +2,14 @@
 mean."""
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from lio_jax.core.error_state import (
     BIASES,
@@ -27,7 +28,7 @@ from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
 from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.prefix_sum import prefix_sum
 from lio_jax.core.types import ImuBatch, NavState
-from lio_jax.imu.discretise import discretise, process_noise
+from lio_jax.imu.discretise import IntervalNoise, discretise, process_noise, process_noise_slopes
 from lio_jax.imu.params import ImuParams
 from lio_jax.imu.path import Path
 from lio_jax.imu.preintegration import (
@@ -161,10 +162,10 @@ def propagate_sweep(
     moved = dataclasses.replace(nav, T_world_imu=last, velocity=path.velocity[-1])
 
     motion = _SampledMotion(intervals, shift, path.rate, path.accel, increments)
-    model = _ImuModel(nav.gyro_bias, nav.accel_bias, nav.time_offset, params, unmeasured)
     times = start, end, sweep_start
-    held = jax.lax.stop_gradient(model)
     known = _effects_of(*jax.lax.stop_gradient((motion, params, *times)))
+    model = _ImuModel(*_added_to_samples(nav, intervals.measured, unmeasured), nav.time_offset, params)
+    held = jax.lax.stop_gradient(model)
     effects = with_derivative_of(known, _linear_effects, model, held, imu, times)
 
     shown = still_to_show(start, sweep_start, end)
@@ -189,12 +190,12 @@ class _SampledMotion(NamedTuple):
 class _ImuModel(NamedTuple):
     """What the effects of a span's samples depend on, beside the samples."""
 
-    gyro_bias: Float[Array, "3"]
-    accel_bias: Float[Array, "3"]
+    rate: Float[Array, "3"]
+    """Added to the sampled angular rates, rad/s, IMU frame."""
+    accel: Float[Array, "3"]
+    """Added to the sampled specific forces, m/s^2, IMU frame."""
     time_offset: Float[Array, ""]
     noise: ImuParams
-    unmeasured: tuple[Float[Array, "3"], Float[Array, "3"]]
-    """Rate and weightless force where nothing is measured, rad/s and m/s^2, IMU frame."""
 
 
 class _Effects(NamedTuple):
@@ -209,9 +210,29 @@ class _Effects(NamedTuple):
     """Derivative by the time offset."""
 
 
+class _Response(NamedTuple):
+    """Derivatives of rotation, position and velocity at the span's end, and of ``LAG``."""
+
+    inputs: Float[Array, "n 15 6"]
+    """By the angular rate and the specific force of each interval."""
+    by_offset: Float[Array, "15"]
+    """By the time offset."""
+
+
 def _effects_of(
     motion: _SampledMotion, noise: ImuParams, start: Array, end: Array, sweep_start: Array
 ) -> _Effects:
+    intervals = motion.intervals
+    response = _response_of(motion, start, end, sweep_start)
+    each = discretise(noise, intervals.duration, intervals.gap, intervals.known)
+    return _Effects(
+        noise=process_noise(response.inputs, each, intervals.measured),
+        by_bias=_by_bias(response, intervals.measured),
+        by_offset=response.by_offset,
+    )
+
+
+def _response_of(motion: _SampledMotion, start: Array, end: Array, sweep_start: Array) -> _Response:
     intervals, shift, rate, accel, increments = motion
     effect = sensitivity(increments, intervals.duration, rate, accel)
     knots = start + increments.time
@@ -221,12 +242,11 @@ def _effects_of(
     signal = jnp.concatenate([shift.gyro, shift.accel], axis=1)
     lag_by_offset = lag_of_durations(effect, shift.duration, knots, sweep_start, end)
     moved_knots = jnp.concatenate([shift.duration @ effect.duration, lag_by_offset])
-    each = discretise(noise, intervals.duration, intervals.gap, intervals.known)
-    return _Effects(
-        noise=process_noise(inputs, each, intervals.measured),
-        by_bias=jnp.where(intervals.measured, -jnp.sum(inputs, axis=0), 0.0),
-        by_offset=jnp.einsum("nij,nj->i", inputs, signal) + moved_knots,
-    )
+    return _Response(inputs, jnp.einsum("nij,nj->i", inputs, signal) + moved_knots)
+
+
+def _by_bias(response: _Response, measured: Bool[Array, ""]) -> Float[Array, "15 6"]:
+    return jnp.where(measured, -jnp.sum(response.inputs, axis=0), 0.0)
 
 
 def _linear_effects(model: _ImuModel, held: _ImuModel, imu: ImuBatch, times: tuple) -> _Effects:
@@ -234,20 +254,50 @@ def _linear_effects(model: _ImuModel, held: _ImuModel, imu: ImuBatch, times: tup
 
     The slope by each of its few numbers is worked out once, so the cost grows little with the number of
     tangents. This holds as long as ``model`` alone has tangents: any other argument with tangents would make
-    every slope a second derivative along each of them.
+    every slope a second derivative along each of them. The covariance is quadratic in the response to the
+    samples and linear in the variances of their noise, so the slopes by the noise need none of the response.
     """
-    at, numbers = ravel_pytree(held)
+    intervals, _ = _intervals_and_shift(imu, held.time_offset, *times[:2])
+    measured = intervals.measured
 
-    def effects(x: Array) -> _Effects:
-        gyro_bias, accel_bias, time_offset, noise, unmeasured = numbers(x)
-        intervals, shift = _intervals_and_shift(imu, time_offset, *times[:2])
-        rate, accel = intervals.without_bias(gyro_bias, accel_bias, unmeasured)
-        increments = accumulate(intervals.duration, rate, accel)
-        return _effects_of(_SampledMotion(intervals, shift, rate, accel, increments), noise, *times)
+    def response(x: Array) -> _Response:
+        moved, shift = _intervals_and_shift(imu, x[6], *times[:2])
+        rate, accel = moved.gyro + x[:3], moved.accel + x[3:6]
+        increments = accumulate(moved.duration, rate, accel)
+        return _response_of(_SampledMotion(moved, shift, rate, accel, increments), *times)
 
-    slopes = jax.vmap(lambda unit: jax.jvp(effects, (at,), (unit,))[1])(jnp.eye(len(at), dtype=at.dtype))
-    moved = ravel_pytree(model)[0] - at
-    return jax.tree.map(lambda value, slope: value + jnp.tensordot(moved, slope, 1), effects(at), slopes)
+    def variances(noise: Array) -> IntervalNoise:
+        return discretise(densities(noise), intervals.duration, intervals.gap, intervals.known)
+
+    at = jnp.concatenate([held.rate, held.accel, held.time_offset[None]])
+    moved = jnp.concatenate([model.rate, model.accel, model.time_offset[None]]) - at
+    noise_at, densities = ravel_pytree(held.noise)
+    noise_moved = ravel_pytree(model.noise)[0] - noise_at
+
+    value, slopes = _value_and_slopes(response, at)
+    each, each_slopes = _value_and_slopes(variances, noise_at)
+    by_response, by_variances = process_noise_slopes(value.inputs, slopes.inputs, each, each_slopes, measured)
+    noise = jnp.tensordot(moved, by_response, 1) + jnp.tensordot(noise_moved, by_variances, 1)
+    by_bias = jnp.tensordot(moved, jax.vmap(lambda slope: _by_bias(slope, measured))(slopes), 1)
+    return _Effects(
+        noise=process_noise(value.inputs, each, measured) + noise,
+        by_bias=_by_bias(value, measured) + by_bias,
+        by_offset=value.by_offset + moved @ slopes.by_offset,
+    )
+
+
+def _value_and_slopes(function: Callable[[Array], Any], at: Float[Array, " d"]) -> tuple[Any, Any]:
+    """Return a function's value, and its derivatives by each of d numbers along a new first axis."""
+    units = jnp.eye(len(at), dtype=at.dtype)
+    return function(at), jax.vmap(lambda unit: jax.jvp(function, (at,), (unit,))[1])(units)
+
+
+def _added_to_samples(
+    nav: NavState, measured: Bool[Array, ""], unmeasured: tuple[Float[Array, "3"], Float[Array, "3"]]
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Return what is added to sampled rates and forces: minus the bias; the motion itself without samples."""
+    rate, accel = unmeasured
+    return jnp.where(measured, -nav.gyro_bias, rate), jnp.where(measured, -nav.accel_bias, accel)
 
 
 def _intervals_and_shift(

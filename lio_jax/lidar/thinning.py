@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Float32, Int32
 
+from lio_jax.core.geometry import dot3
 from lio_jax.core.hashing import voxel_hash
 from lio_jax.core.prefix_sum import counts_before, running_count
 from lio_jax.core.types import Scan
@@ -106,7 +107,7 @@ def thinned(
         insertion_points: capacity for the points of the map.
         registration_points: capacity for the points to match.
     """
-    squared_range = jnp.sum(scan.points**2, -1)
+    squared_range = dot3(scan.points, scan.points)
     near, far = lidar.min_range.astype(jnp.float32), lidar.max_range.astype(jnp.float32)
     mask = scan.mask & (squared_range > near**2) & (squared_range < far**2)
     chosen = select_per_voxel(scan.points, mask, map_spacing, insertion_points)

@@ -14,7 +14,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int32, UInt32
 
-from lio_jax.core.geometry import eigenvalues_and_normal3
+from lio_jax.core.geometry import dot3, eigenvalues_and_normal3
 from lio_jax.core.hashing import voxel_hash
 from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.prefix_sum import running_count
@@ -387,7 +387,7 @@ def _claim_slots(
         candidate = first + way
         # as floats, because the integer coordinates of a free slot would overflow; they count as far away
         apart = _take(vmap.voxel, candidate).astype(jnp.float32) - anchor.astype(jnp.float32)
-        open_slot = jnp.linalg.norm(apart, axis=-1) > reach
+        open_slot = dot3(apart, apart) > reach**2
         asks = homeless & open_slot & (_take(claims, candidate) < 0)
         claims = claims.at[jnp.where(asks, candidate, capacity)].max(order, mode="drop")
         winner = _take(claims, candidate)

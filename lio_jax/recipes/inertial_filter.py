@@ -22,7 +22,7 @@ from lio_jax.core.error_state import (
     SweptState,
     sphere_basis,
 )
-from lio_jax.core.geometry import from_blocks, rotation_matrix, skew
+from lio_jax.core.geometry import from_blocks, inverse, rotation_matrix, skew
 from lio_jax.core.types import ITERATION_LIMIT, ImuBatch, NavState, Scan
 from lio_jax.estimation.iterated_filter import Measurement, Update
 from lio_jax.estimation.map_drift import MapDrift, error_by_planes
@@ -171,7 +171,7 @@ class _Measured(eqx.Module):
             equations.hessian, equations.gradient, equations.arm_squared, settings.inertial_degeneracy_ratio
         )
         information = settings.information_scale * information
-        softer = jnp.linalg.inv(jnp.eye(6, dtype=information.dtype) + information @ self.curvature)
+        softer = inverse(jnp.eye(6, dtype=information.dtype) + information @ self.curvature)
         softened = softer @ information
         return Measurement(
             information=(softened + softened.T) / 2,

@@ -13,7 +13,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
 from lio_jax.core.error_state import DOF, GYRO_BIAS, POSITION, ROTATION, VELOCITY, NavEstimate
-from lio_jax.core.geometry import adjoint, from_blocks, rotation_matrix, skew
+from lio_jax.core.geometry import adjoint, from_blocks, inverse, rotation_matrix, skew
 from lio_jax.core.types import NavState, initial_nav_state
 from lio_jax.estimation.map_drift import MapDrift, error_by_planes
 from lio_jax.estimation.pose_measurement import keep_observed, lidar_pose_jacobian
@@ -189,7 +189,7 @@ def _matched(
     by_pose = lidar_pose_jacobian(nav)
     reached = by_pose @ covariance
     inside = jnp.eye(6, dtype=covariance.dtype) + reached @ by_pose.T @ information
-    gain = reached.T @ information @ jnp.linalg.inv(inside)
+    gain = reached.T @ information @ inverse(inside)
     covariance, cross = covariance - gain @ reached, cross - gain @ by_pose @ cross
     return (covariance + covariance.T) / 2, cross, information
 

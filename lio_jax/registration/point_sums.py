@@ -87,8 +87,8 @@ def _summed_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     by_place = slopes(0)
     total_dot = jnp.zeros_like(total)
     if points_dot is not None:
-        by_point = jnp.tensordot(R.T, by_place, 1)
-        total_dot += jnp.tensordot(by_point, points_dot, ((0, 2), (1, 0)))
+        flat = jnp.swapaxes(by_place, 0, 1).reshape(len(total), -1)
+        total_dot += flat @ (R @ points_dot.T).ravel()
     if R_dot is not None:
         total_dot += jnp.tensordot(R_dot, jnp.tensordot(by_place, points, ((2,), (0,))), ((0, 1), (0, 2)))
     if shift_dot is not None:

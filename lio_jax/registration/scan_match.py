@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.geometry import rotation_matrix
+from lio_jax.core.geometry import dot3, rotation_matrix
 from lio_jax.registration.params import RegistrationParams
 
 _Found = TypeVar("_Found")
@@ -59,7 +59,7 @@ def associated(
     moved = jnp.linalg.norm(move) + last.arm * jnp.linalg.norm(turn) / jnp.sqrt(2.0)
 
     def anew() -> Association[_Found]:
-        squared = jnp.where(mask, jnp.sum(points**2, -1), 0.0)
+        squared = jnp.where(mask, dot3(points, points), 0.0)
         arm = jnp.sqrt(jnp.sum(squared) / jnp.maximum(jnp.sum(mask), 1)).astype(last.arm.dtype)
         return Association(find(), T_world_lidar, arm)
 

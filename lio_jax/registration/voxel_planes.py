@@ -10,7 +10,7 @@ import jaxlie
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.geometry import across, normal_slope3
+from lio_jax.core.geometry import across, dot3, normal_slope3
 from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.xla import computed_once
 from lio_jax.lidar.params import BeamParams
@@ -137,7 +137,7 @@ def _coordinates(
     def along(unit: Array) -> Array:
         change = surface_slope(held, normal, jnp.broadcast_to(unit, held.shape))
         components = ((change.normal, first), (change.normal, second), (change.mean, normal))
-        moved = [jnp.sum(of * axis, -1) for of, axis in components]
+        moved = [dot3(of, axis) for of, axis in components]
         return jnp.stack([*moved, *change.variances.T], -1)
 
     slopes = computed_once(jnp.moveaxis(jax.vmap(along)(jnp.eye(10, dtype=held.dtype)[1:]), -1, 1))
@@ -221,14 +221,14 @@ def point_variances(lidar: BeamParams, dtype: jnp.dtype) -> tuple[Array, Array]:
 
 
 def plane_noise(matches: Matches, arm: Array, shift: Array, facing: Array, turning: Array) -> PointNoise:
-    along = jnp.sum(arm * matches.normal, -1)
-    range_squared = jnp.sum(arm**2, -1)
+    along = dot3(arm, matches.normal)
+    range_squared = dot3(arm, arm)
     across = jnp.maximum(range_squared - along**2, 0.0)
     flat, wide = matches.variances[:, 0], matches.variances[:, 1]
     shaped = jnp.stack([flat, jnp.maximum(flat, wide - matches.least_variance)], -1)
     variances = (facing + turning * across)[:, None] + shaped
     known = 1 / variances
-    distance = jnp.sum(matches.normal * (arm + shift - matches.mean), -1)
+    distance = dot3(matches.normal, arm + shift - matches.mean)
     distance = jnp.where(matches.used, distance, 0.0)
     precision = jnp.where(matches.used, known[:, 0] - known[:, 1], 0.0)
     return PointNoise(
@@ -275,7 +275,7 @@ def linearise(
     )
     matched = matches.used.astype(kind)
     facing, turning = point_variances(lidar, kind)
-    arm_squared = matched * jnp.sum(arm**2, -1)
+    arm_squared = matched * dot3(arm, arm)
     scalars = [matched, weight, weight * noise.scaled_squared, arm_squared]
     scalars += [noise.blur(facing), _log_or_zero(arm_squared)]
     weighted = jnp.concatenate([(weight * noise.precision)[:, None] * row, jnp.stack(scalars, -1)], -1)
@@ -313,7 +313,7 @@ def _rows(arm: Array, shift: Array, scales: Array, coordinates: Array | None, ma
     noise = plane_noise(matches, arm.T, shift, facing, turning)
     weight = noise.weight(kernel)
     columns = [*jnp.cross(noise.arm, matches.normal).T, *matches.normal.T, noise.distance]
-    arm_squared = jnp.where(matches.used, jnp.sum(noise.arm**2, -1), 0.0)
+    arm_squared = jnp.where(matches.used, dot3(noise.arm, noise.arm), 0.0)
     return jnp.concatenate(
         [
             products(columns, weight * noise.precision)[:-1],
