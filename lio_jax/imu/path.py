@@ -1,6 +1,7 @@
 """The motion between two filter states at every instant, for deskewing."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,6 +10,7 @@ import jaxlie
 from jaxtyping import Array, Float, Int32
 
 from lio_jax.core.geometry import rotation_matrix
+from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.xla import computed_once
 from lio_jax.imu.rotation_integrals import SERIES_LIMIT, rotation_series
 
@@ -117,18 +119,113 @@ def _interval_at(knots: Float[Array, " k"], time: Float[Array, " n"]) -> Int32[A
     return jnp.sum(knots[1:-1] <= time[:, None], axis=1, dtype=jnp.int32)
 
 
+class _PerPoint(NamedTuple):
+    """What moves each of n points: everything of its interval, its delay and its place in the body frame."""
+
+    rows: Float[Array, "n 24"]
+    """The interval's vectors."""
+    delay: Float[Array, " n"]
+    """Time since the interval's start, s."""
+    gravity: Float[Array, "3"]
+    """m/s^2."""
+    points: Float[Array, "n 3"]
+    """m, body frame."""
+
+
+def _per_point(motion: _Motion, time: Float[Array, " n"], points: Float[Array, "n 3"]) -> _PerPoint:
+    interval = _interval_at(motion.time, time)
+    # a single gather of whole rows
+    rows = motion.vectors.reshape(-1, 24)[interval]
+    return _PerPoint(rows, time.astype(rows.dtype) - motion.time[interval], motion.gravity, points)
+
+
 def _carried(motion: _Motion, time: Float[Array, " n"], points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Return points, given in the body frame at their own times, in the motion's frame.
+    """Return points, given in the body frame at their own times, in the motion's frame."""
+    each = _per_point(motion, time, points)
+    known = _placed(*jax.lax.stop_gradient(each))
+    return with_derivative_of(known, _placed_slope, jax.lax.stop_gradient(each), each)
+
+
+def _placed(
+    rows: Float[Array, "n 24"], h: Float[Array, " n"], gravity: Float[Array, "3"], points: Float[Array, "n 3"]
+) -> Float[Array, "n 3"]:
+    return jnp.stack(_each(_place(_vectors(rows), h, gravity, _triple(points, 0)))).T
+
+
+def _placed_slope(held: _PerPoint, each: _PerPoint) -> Float[Array, "n 3"]:
+    """Return a linear function of what moves the points, whose slope is that of :func:`_placed` at ``held``.
+
+    Three matrices and a velocity per point are worked out once for all tangents. Nothing but the angular rate
+    and the delay enters in a nonlinear way.
+    """
+    vectors, gravity, points = _vectors(held.rows), held.gravity, _triple(held.points, 0)
+    h = held.delay
+    zero = jnp.zeros_like(h)
+    nothing = (zero, zero, zero)
+    units = [tuple(jnp.ones_like(h) if i == j else zero for j in range(3)) for i in range(3)]
+
+    def along(direction: tuple[_Triple, Array]) -> _Triple:
+        def moved(rate: _Triple, delay: Array) -> _Triple:
+            return _each(_place(vectors._replace(rate=rate), delay, gravity, points))
+
+        return jax.jvp(moved, (vectors.rate, h), direction)[1]
+
+    def turned(vector: _Triple, force: _Triple) -> _Triple:
+        only = _Vectors(*((nothing,) * 3), vector, vectors.rate, force, nothing, nothing)
+        return _each(_place(only, h, jnp.zeros_like(gravity), nothing))
+
+    by_rate = [along((unit, zero)) for unit in units]
+    by_delay = along((nothing, jnp.ones_like(h)))
+    by_arm, by_force = [turned(unit, nothing) for unit in units], [turned(nothing, unit) for unit in units]
+    by_rate, by_delay, by_arm, by_force = computed_once((by_rate, by_delay, by_arm, by_force))
+
+    change = _vectors(each.rows - held.rows)
+    longer = each.delay - h
+    steeper = each.gravity - gravity
+    further = _triple(each.points - held.points, 0)
+    axes, held_axes = change[:3], vectors[:3]
+
+    def arm(i: int) -> Array:
+        spread = sum(x * axis[i] for x, axis in zip(points, axes, strict=True))
+        return spread + sum(dx * axis[i] for dx, axis in zip(further, held_axes, strict=True)) + change.arm[i]
+
+    moved_arm = _each(arm)
+
+    def column(i: int) -> Array:
+        fallen = change.position[i] + h * (change.velocity[i] + h / 2 * steeper[i]) + by_delay[i] * longer
+        parts = (by_rate, change.rate), (by_force, change.force), (by_arm, moved_arm)
+        return fallen + sum(by[m][i] * of[m] for by, of in parts for m in range(3))
+
+    return jnp.stack(_each(column)).T
+
+
+class _Vectors(NamedTuple):
+    """The vectors of :class:`_Motion` at each of n points."""
+
+    x_axis: _Triple
+    y_axis: _Triple
+    z_axis: _Triple
+    arm: _Triple
+    rate: _Triple
+    force: _Triple
+    position: _Triple
+    velocity: _Triple
+
+
+def _vectors(rows: Float[Array, "n 24"]) -> _Vectors:
+    return _Vectors(*(_triple(rows, 3 * i) for i in range(8)))
+
+
+def _place(
+    vectors: _Vectors, h: Float[Array, " n"], gravity: Float[Array, "3"], points: _Triple
+) -> Callable[[int], Array]:
+    """Return points in the motion's frame, component by component.
 
     With w = h rate the rotated point is p + a w x p + b w x (w x p), where p and the rate are in the axes of
     the motion. The second integral of the rotating specific force has the same form.
     """
-    interval = _interval_at(motion.time, time)
-    # a single gather of whole rows
-    rows = motion.vectors.reshape(-1, 24)[interval]
-    h = time.astype(rows.dtype) - motion.time[interval]
-    x_axis, y_axis, z_axis, arm, rate, force, position, velocity = (_triple(rows, 3 * i) for i in range(8))
-    x, y, z = points.T
+    x_axis, y_axis, z_axis, arm, rate, force, position, velocity = vectors
+    x, y, z = points
     p = _each(lambda i: x * x_axis[i] + y * y_axis[i] + z * z_axis[i] + arm[i])
     w = _each(lambda i: h * rate[i])
     # computed once, and not for each column again
@@ -137,11 +234,11 @@ def _carried(motion: _Motion, time: Float[Array, " n"], points: Float[Array, "n 
     twice, pushed_twice = _cross(w, turned), _cross(w, pushed)
 
     def column(i: int) -> Array:
-        fallen = position[i] + h * (velocity[i] + h / 2 * motion.gravity[i])
+        fallen = position[i] + h * (velocity[i] + h / 2 * gravity[i])
         driven = h**2 * (force[i] / 2 + c * pushed[i] + d * pushed_twice[i])
         return fallen + driven + p[i] + a * turned[i] + b * twice[i]
 
-    return jnp.stack(_each(column)).T
+    return column
 
 
 def _triple(rows: Array, first: int) -> _Triple:

@@ -1,11 +1,11 @@
-"""Closed forms on 3x3 symmetric matrices against LAPACK in double precision."""
+"""Closed forms on 3x3 symmetric matrices against LAPACK in double precision, and slopes of the inverse."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lio_jax.core.geometry import eigenvalues_and_normal3
+from lio_jax.core.geometry import eigenvalues_and_normal3, inverse
 
 PRECISIONS = [jnp.float32, jnp.float64]
 
@@ -108,3 +108,16 @@ def test_any_batch_shape():
     full = matrices((3.0, 2.0, 1.0), count=6).reshape(2, 3, 3, 3)
     values, normals = eigenvalues_and_normal3(*parts(full, jnp.float64))
     assert values.shape == normals.shape == (2, 3, 3)
+
+
+def test_derivatives_of_the_inverse_are_finite_differences():
+    rng = np.random.default_rng(5)
+    matrix, direction = rng.normal(size=(2, 6, 6))
+    matrix += 6 * np.eye(6)
+    h = 1e-6
+    difference = (np.linalg.inv(matrix + h * direction) - np.linalg.inv(matrix - h * direction)) / (2 * h)
+    _, forward = jax.jit(lambda a, b: jax.jvp(inverse, (a,), (b,)))(matrix, direction)
+    np.testing.assert_allclose(forward, difference, rtol=1e-7, atol=1e-9)
+    weights = rng.normal(size=(6, 6))
+    slope = jax.jit(jax.grad(lambda matrix: jnp.sum(weights * inverse(matrix))))(matrix)
+    np.testing.assert_allclose(np.sum(slope * direction), np.sum(weights * difference), rtol=1e-7)

@@ -6,8 +6,8 @@ import jaxlie
 import numpy as np
 import pytest
 
-from lio_jax.core.error_state import DOF, TIME_OFFSET, retract
-from lio_jax.estimation.pose_measurement import keep_observed, lidar_pose_jacobian
+from lio_jax.core.error_state import DOF, POSITION, ROTATION, TIME_OFFSET, retract
+from lio_jax.estimation.pose_measurement import imu_pose_jacobian, keep_observed, lidar_pose_jacobian
 from tests.estimation.navs import random_nav
 
 keep = jax.jit(keep_observed)
@@ -36,6 +36,14 @@ def test_the_jacobian_is_that_of_the_lidar_pose(seed) -> None:
     jacobian = jax.jit(lidar_pose_jacobian)(nav)
     np.testing.assert_allclose(jacobian, pose_jacobian_by_differentiation(nav), atol=1e-12)
     assert not np.any(np.asarray(jacobian)[:, TIME_OFFSET])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_imu_pose_jacobian_moves_the_lidar_alike(seed) -> None:
+    nav = random_nav(seed)
+    by_error = np.asarray(jax.jit(lidar_pose_jacobian)(nav))
+    by_pose = np.hstack([by_error[:, ROTATION], by_error[:, POSITION]])
+    np.testing.assert_allclose(by_pose @ np.asarray(imu_pose_jacobian(nav)), by_error, atol=1e-12)
 
 
 def tunnel(seed):

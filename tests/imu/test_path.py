@@ -126,24 +126,41 @@ def test_deskewed_points_stand_still(path: Path, kilometres: float) -> None:
     np.testing.assert_allclose(got, expected, atol=1e-3)
 
 
-@pytest.fixture(scope="module")
-def along_a_line(path: Path):
-    """Return a scalar of carried points and poses for other rates, and its gradient by them."""
-    rng = np.random.default_rng(2)
-    times, points = jnp.asarray(rng.uniform(0, END, 20)), jnp.asarray(rng.normal(size=(20, 3)))
-    weights = jnp.asarray(rng.normal(size=(20, 3)))
-
-    def value(rate):
-        turned = dataclasses.replace(path, rate=rate)
-        return jnp.sum(weights * carry(turned, times, points)) + jnp.sum(pose_at(turned, times).log())
-
-    return quick_jit(jax.value_and_grad(value))
+def carried_along(direction: tuple, path: Path, times, points, by: float):
+    """Return where the points are after a step along a direction of everything that moves them."""
+    moved = jax.tree.map(lambda x, dx: x + by * dx, (path, times, points), direction)
+    return carry(*moved)
 
 
 @pytest.mark.parametrize("still", [False, True])
-def test_gradients_are_finite_differences(along_a_line, path: Path, still: bool) -> None:
-    rate = jnp.zeros_like(path.rate) if still else path.rate
-    along = jnp.asarray(np.random.default_rng(3).normal(size=rate.shape))
+def test_derivatives_are_finite_differences(path: Path, still: bool) -> None:
+    """By knots, poses, velocities, rates, forces, gravity, times and points, in both modes."""
+    rng = np.random.default_rng(2)
+    path = dataclasses.replace(path, rate=jnp.zeros_like(path.rate)) if still else path
+    moved = (path, jnp.asarray(rng.uniform(0, END, 20)), jnp.asarray(rng.normal(size=(20, 3))))
+    direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), moved)
     h = 1e-6
-    difference = (along_a_line(rate + h * along)[0] - along_a_line(rate - h * along)[0]) / (2 * h)
-    np.testing.assert_allclose(jnp.sum(along_a_line(rate)[1] * along), difference, rtol=1e-6)
+    at = quick_jit(lambda by: carried_along(direction, *moved, by))
+    difference = (at(h) - at(-h)) / (2 * h)
+    forward = quick_jit(lambda: jax.jvp(carry, moved, direction)[1])()
+    np.testing.assert_allclose(forward, difference, rtol=1e-6, atol=1e-6)
+
+    weights = jnp.asarray(rng.normal(size=(20, 3)))
+    slopes = quick_jit(jax.grad(lambda moved: jnp.sum(weights * carry(*moved))))(moved)
+    along = sum(jax.tree.leaves(jax.tree.map(lambda g, d: jnp.sum(g * d), slopes, direction)))
+    np.testing.assert_allclose(along, jnp.sum(weights * difference), rtol=1e-6)
+
+
+@pytest.mark.parametrize("still", [False, True])
+def test_gradients_of_poses_are_finite_differences(path: Path, still: bool) -> None:
+    rng = np.random.default_rng(3)
+    times = jnp.asarray(rng.uniform(0, END, 20))
+
+    def value(rate):
+        return jnp.sum(pose_at(dataclasses.replace(path, rate=rate), times).log())
+
+    rate = jnp.zeros_like(path.rate) if still else path.rate
+    along, h = jnp.asarray(rng.normal(size=rate.shape)), 1e-6
+    sums = quick_jit(jax.value_and_grad(value))
+    difference = (sums(rate + h * along)[0] - sums(rate - h * along)[0]) / (2 * h)
+    np.testing.assert_allclose(jnp.sum(sums(rate)[1] * along), difference, rtol=1e-6)
