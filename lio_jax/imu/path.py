@@ -161,8 +161,8 @@ def _placed_slope(held: _PerPoint, each: _PerPoint) -> Float[Array, "n 3"]:
     vectors, gravity, points = _vectors(held.rows), held.gravity, _triple(held.points, 0)
     h = held.delay
     zero = jnp.zeros_like(h)
-    nothing = (zero, zero, zero)
-    units = [tuple(jnp.ones_like(h) if i == j else zero for j in range(3)) for i in range(3)]
+    one, nothing = jnp.ones_like(h), (zero, zero, zero)
+    units = (one, zero, zero), (zero, one, zero), (zero, zero, one)
 
     def along(direction: tuple[_Triple, Array]) -> _Triple:
         def moved(rate: _Triple, delay: Array) -> _Triple:
@@ -175,7 +175,7 @@ def _placed_slope(held: _PerPoint, each: _PerPoint) -> Float[Array, "n 3"]:
         return _each(_place(only, h, jnp.zeros_like(gravity), nothing))
 
     by_rate = [along((unit, zero)) for unit in units]
-    by_delay = along((nothing, jnp.ones_like(h)))
+    by_delay = along((nothing, one))
     by_arm, by_force = [turned(unit, nothing) for unit in units], [turned(nothing, unit) for unit in units]
     by_rate, by_delay, by_arm, by_force = computed_once((by_rate, by_delay, by_arm, by_force))
 

@@ -1,9 +1,11 @@
 """What is tuned or trained: recordings, the parameters as a vector with its bounds, and their loss."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,6 +93,44 @@ class Problem:
         for path, value in self.free.overrides(x).items():
             settings = settings.with_value(path, value, "tuned")
         return settings
+
+
+def identity(problem: Problem) -> dict[str, Any]:
+    """Return what tells a problem from others, by the words in which another one is refused.
+
+    It consists of lists, numbers and words: JSON keeps it as it is.
+    """
+    return {
+        "objective": problem.named.name,
+        "parameters": list(problem.free.names),
+        "values of parameters": problem.settings.values,
+        "recipe": problem.settings.recipe,
+        "config": repr(problem.settings.config),
+        "recordings": [piece.name for piece in problem.training],
+        "pieces": [len(piece) for piece in problem.training],
+        "recordings that judge": [judge.name for judge in problem.validation],
+    }
+
+
+def refuse_another(path: Path, kind: str, held: Mapping[str, Any], own: Mapping[str, Any]) -> None:
+    """Refuse to continue from a file that another problem has left.
+
+    Args:
+        path: of the file.
+        kind: what it holds, such as ``a training``.
+        held: the identity in the file.
+        own: that of the problem which would go on.
+
+    Raises:
+        UsageError: they differ. It names what differs.
+    """
+    other = [name for name, value in own.items() if held[name] != value]
+    if other:
+        was = f" (it has {held['objective']})" if "objective" in other else ""
+        raise UsageError(
+            f"{path}: is {kind} with other {', '.join(other)}{was}; give another --out, or --overwrite to "
+            "begin anew."
+        )
 
 
 def problem_of(

@@ -17,8 +17,7 @@ from lio_jax.core.files import atomic_path
 from lio_jax.tuning.evaluated import Evaluated, validation_loss
 from lio_jax.tuning.objectives import nothing_counts, nothing_depends
 from lio_jax.tuning.optimise import Bounds, adam, fisher_scoring, lbfgsb, parameter_covariance, stationary
-from lio_jax.tuning.parameters import ParameterVector
-from lio_jax.tuning.problem import Problem
+from lio_jax.tuning.problem import Problem, identity, refuse_another
 from lio_jax.tuning.recording import Recording
 
 HISTORY = "history.json"
@@ -70,7 +69,9 @@ class Session:
             observer: called after every evaluation.
 
         Raises:
-            LioJaxError: the history is that of other parameters.
+            UsageError: the history is that of another objective, of other parameters, values, settings or
+                recordings.
+            LioJaxError: it cannot be read.
         """
         self._path = None if folder is None else folder / HISTORY
         if folder is not None:
@@ -79,7 +80,7 @@ class Session:
         self._unit: NDArray[np.float64] | None = None
         self.history: list[Iterate] = []
         if self._path is not None and self._path.exists():
-            self.history = _read(self._path, problem.free)
+            self.history = _read(self._path, problem)
 
     @property
     def best(self) -> Iterate:
@@ -172,24 +173,25 @@ class Session:
         if self._path is None:
             return
         held: dict[str, Any] = {
-            "names": self._problem.free.names,
+            "identity": identity(self._problem),
             "iterates": [asdict(one) for one in self.history],
         }
         with atomic_path(self._path) as aside:
             aside.write_text(json.dumps(held, indent=1) + "\n")
 
 
-def _read(path: Path, free: ParameterVector) -> list[Iterate]:
-    held = json.loads(path.read_text())
-    if tuple(held["names"]) != free.names:
+def _read(path: Path, problem: Problem) -> list[Iterate]:
+    try:
+        held = json.loads(path.read_text())
+        refuse_another(path, "the history of a tuning", held["identity"], identity(problem))
+        iterates = []
+        for one in held["iterates"]:
+            row: dict[str, Any] = {
+                key: tuple(value) if isinstance(value, list) else value for key, value in one.items()
+            }
+            iterates.append(Iterate(**row))
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise LioJaxError(
-            f"{path}: is the history of other parameters ({', '.join(held['names'])}); "
-            "give another --out, or --overwrite to begin anew."
-        )
-    iterates = []
-    for one in held["iterates"]:
-        row: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value for key, value in one.items()
-        }
-        iterates.append(Iterate(**row))
+            f"{path}: is no history that can be continued ({error}); give --overwrite to begin anew."
+        ) from None
     return iterates

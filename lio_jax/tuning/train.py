@@ -6,6 +6,7 @@ Hutter, "SGDR: Stochastic gradient descent with warm restarts", 2017, without th
 to go on is written after every step, so that a killed training goes on to the same numbers.
 """
 
+import json
 import math
 from collections.abc import Callable
 from collections.abc import Sequence as Listing
@@ -24,7 +25,7 @@ from lio_jax.settings.settings import Settings
 from lio_jax.tuning.evaluated import validation_loss
 from lio_jax.tuning.objectives import Objective, nothing_depends
 from lio_jax.tuning.optimise import Bounds, Moments
-from lio_jax.tuning.problem import Problem, problem_of
+from lio_jax.tuning.problem import Problem, identity, problem_of, refuse_another
 
 TRAINING = "training.npz"
 _Vector = NDArray[np.float64]
@@ -211,21 +212,8 @@ class TrainingSession:
         self._write()
         observer(epoch)
 
-    def _about(self) -> dict[str, Any]:
-        """Return what makes this training this one, by the words in which another one is refused."""
-        problem = self._problem
-        return {
-            "objective": np.array(problem.named.name),
-            "parameters": np.array(problem.free.names),
-            "start values": problem.first(),
-            "recipe": np.array(problem.settings.recipe),
-            "config": np.array(repr(problem.settings.config)),
-            "recordings": np.array([piece.name for piece in problem.training]),
-            "pieces": np.array([len(piece) for piece in problem.training]),
-            "recordings that judge": np.array([judge.name for judge in problem.validation], str),
-            "batch": np.int64(self._schedule.batch),
-            "seed": np.int64(self._schedule.seed),
-        }
+    def _identity(self) -> dict[str, Any]:
+        return identity(self._problem) | {"batch": self._schedule.batch, "seed": self._schedule.seed}
 
     def _write(self) -> None:
         if self._path is None:
@@ -242,23 +230,17 @@ class TrainingSession:
                 losses=np.array(self._losses),
                 skipped=np.int64(self._skipped),
                 epochs=np.array(rows, np.float64).reshape(-1, 3),
-                **self._about(),
+                identity=np.array(json.dumps(self._identity())),
             )
 
     def _take_up(self, path: Path) -> None:
         try:
             held = read_arrays(path)
-            other = [name for name, own in self._about().items() if not np.array_equal(held[name], own)]
+            refuse_another(path, "a training", json.loads(str(held["identity"])), self._identity())
         except (OSError, ValueError, KeyError) as error:
             raise LioJaxError(
                 f"{path}: is no training that can be continued ({error}); give --overwrite to begin anew."
             ) from None
-        if other:
-            was = f" (it has {held['objective']})" if "objective" in other else ""
-            raise UsageError(
-                f"{path}: is a training with other {', '.join(other)}{was}; give another --out, or "
-                "--overwrite to begin anew."
-            )
         self._x, self._best_x = held["x"], held["best_x"]
         self._moments = Moments(held["mean"], held["square"], int(held["steps"]))
         self._losses, self._skipped = held["losses"].tolist(), int(held["skipped"])

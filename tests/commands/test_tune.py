@@ -87,6 +87,9 @@ def test_a_tuning_leaves_settings_history_and_a_picture(recordings, tmp_path, ca
     assert "continuing after 3 evaluations" in capsys.readouterr().err
     assert len(json.loads((out / "history.json").read_text())["iterates"]) == 4
 
+    assert main([*words, "--iterations", "4", "--objective", "ate"]) == 2
+    assert "history of a tuning with other objective (it has pose+ranges)" in capsys.readouterr().err
+
 
 def test_tune_from_python_is_that_of_the_command(recordings, tmp_path):
     words = ["tune", recordings[0], *PARAMS, "--out", str(tmp_path / "command"), *SMALL]

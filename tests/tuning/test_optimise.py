@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from lio_jax.core.errors import LioJaxError
+from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.tuning.gradient import Evaluated
+from lio_jax.tuning.objectives import objective_named
 from lio_jax.tuning.optimise import (
     Bounds,
     adam,
@@ -26,15 +27,28 @@ WIDE = Bounds(np.full(2, -20.0), np.full(2, 20.0))
 SAMPLES = np.random.default_rng(0).normal(0.0, [0.02, 3.0], (4000, 2))
 
 
-def problem(loss, scored=True):
+class Drive:
+    """Stands for a recording."""
+
+    def __init__(self, name="drive"):
+        self.name = name
+
+    def __len__(self):
+        return len(SAMPLES)
+
+
+def problem(loss, scored=True, **changed):
     """Return what a session sees of a problem with one recording."""
-    return SimpleNamespace(
-        free=free_parameters(default_params(), ["imu.gyro_noise", "lidar.range_sigma"]),
-        loss=loss,
-        training=(None,),
-        validation=(),
-        scored=scored,
-    )
+    seen = {
+        "free": free_parameters(default_params(), ["imu.gyro_noise", "lidar.range_sigma"]),
+        "loss": loss,
+        "named": objective_named("noise"),
+        "settings": SimpleNamespace(recipe="default", config=1, values={}),
+        "training": (Drive(),),
+        "validation": (),
+        "scored": scored,
+    }
+    return SimpleNamespace(**{**seen, **changed})
 
 
 def noise_likelihood(x):
@@ -198,7 +212,7 @@ def test_a_killed_tuning_goes_on_from_its_last_iterate(tmp_path):
     with pytest.raises(Killed):
         first.run("scoring", BEST + 1.5, WIDE, 30, 0)
     held = json.loads((tmp_path / HISTORY).read_text())
-    assert held["names"] == list(FREE.names)
+    assert held["identity"]["parameters"] == list(FREE.names)
     assert len(held["iterates"]) == 3
 
     second = session(tmp_path)
@@ -209,9 +223,26 @@ def test_a_killed_tuning_goes_on_from_its_last_iterate(tmp_path):
     assert len(second.history) <= 30
 
 
-def test_the_history_of_other_parameters_is_refused(tmp_path):
-    (tmp_path / HISTORY).write_text(json.dumps({"names": ["imu.accel_noise"], "iterates": []}))
-    with pytest.raises(LioJaxError, match=r"imu\.accel_noise.*--overwrite"):
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"free": free_parameters(default_params(), ["imu.accel_noise"])}, "parameters"),
+        ({"named": objective_named("ate")}, r"objective \(it has pose\+ranges\)"),
+        ({"training": (Drive("other"),)}, "recordings"),
+    ],
+)
+def test_the_history_of_another_tuning_is_refused(tmp_path, changed, named):
+    session(tmp_path).run("scoring", BEST + 1.5, WIDE, 1, 0)
+    with pytest.raises(
+        UsageError, match=rf"{HISTORY}: is the history of a tuning with other {named}; .*--overwrite"
+    ):
+        Session(problem(lambda x, recordings: noise_likelihood(x), **changed), tmp_path, 50)
+
+
+@pytest.mark.parametrize("written", ["", "[]", '{"names": []}', '{"identity": {}, "iterates": []}'])
+def test_a_history_that_cannot_be_read_is_named(tmp_path, written):
+    (tmp_path / HISTORY).write_text(written)
+    with pytest.raises(LioJaxError, match=rf"{HISTORY}: is no history that can be continued"):
         session(tmp_path)
 
 

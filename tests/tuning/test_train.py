@@ -57,7 +57,7 @@ def problem(loss=None, judges=(), pieces=SAMPLES, **changed):
         "bounds": lambda: Bounds(BEST - 7, BEST + 7),
         "tuned_settings": lambda x: np.array(x),
         "named": objective_named("pose"),
-        "settings": SimpleNamespace(recipe="default", config=1),
+        "settings": SimpleNamespace(recipe="default", config=1, values={"imu": {"gravity": 9.8}}),
     }
     return SimpleNamespace(**{**seen, **changed})
 
@@ -151,8 +151,11 @@ def own_loss(observed, truth):
         ({"named": objective_named("pose + ranges")}, 0, r"objective \(it has pose\)"),
         ({"named": as_named(MeanOverScans(own_loss))}, 0, r"objective \(it has pose\)"),
         ({"free": OTHER}, 0, "parameters"),
-        ({"first": lambda: START + 1}, 0, "start values"),
-        ({"settings": SimpleNamespace(recipe="loam", config=2)}, 0, "recipe, config"),
+        (
+            {"settings": SimpleNamespace(recipe="loam", config=2, values={})},
+            0,
+            "values of parameters, recipe, config",
+        ),
         ({}, 3, "seed"),
     ],
 )
