@@ -255,7 +255,8 @@ def _linear_effects(model: _ImuModel, held: _ImuModel, imu: ImuBatch, times: tup
     The slope by each of its few numbers is worked out once, so the cost grows little with the number of
     tangents. This holds as long as ``model`` alone has tangents: any other argument with tangents would make
     every slope a second derivative along each of them. The covariance is quadratic in the response to the
-    samples and linear in the variances of their noise, so the slopes by the noise need none of the response.
+    samples and linear in the variances of their noise, so the slopes by what changes the variances need none
+    of the response.
     """
     intervals, _ = _intervals_and_shift(imu, held.time_offset, *times[:2])
     measured = intervals.measured
@@ -266,13 +267,16 @@ def _linear_effects(model: _ImuModel, held: _ImuModel, imu: ImuBatch, times: tup
         increments = accumulate(moved.duration, rate, accel)
         return _response_of(_SampledMotion(moved, shift, rate, accel, increments), *times)
 
-    def variances(noise: Array) -> IntervalNoise:
-        return discretise(densities(noise), intervals.duration, intervals.gap, intervals.known)
+    def variances(x: Array) -> IntervalNoise:
+        time_offset, noise = of_noise(x)
+        cut, _ = _intervals_and_shift(imu, time_offset, *times[:2])
+        return discretise(noise, cut.duration, cut.gap, cut.known)
 
     at = jnp.concatenate([held.rate, held.accel, held.time_offset[None]])
     moved = jnp.concatenate([model.rate, model.accel, model.time_offset[None]]) - at
-    noise_at, densities = ravel_pytree(held.noise)
-    noise_moved = ravel_pytree(model.noise)[0] - noise_at
+    # the time offset changes how long the first and the last interval are, and so their noise
+    noise_at, of_noise = ravel_pytree((held.time_offset, held.noise))
+    noise_moved = ravel_pytree((model.time_offset, model.noise))[0] - noise_at
 
     value, slopes = _value_and_slopes(response, at)
     each, each_slopes = _value_and_slopes(variances, noise_at)

@@ -231,12 +231,15 @@ def test_gradients_are_finite_differences(reverse, imu: ImuBatch, still: bool) -
 def along(directions, x, imu):
     """Return a propagated covariance and its derivatives along directions of 14 numbers.
 
-    The numbers change the velocity, the rate where nothing is measured, the first variances and the noise.
+    The numbers change the velocity, the rate where nothing is measured, the first variances, the time offset
+    and the noise.
     """
 
     def left(x):
         begun = state(ORIGIN, 1e-4 * np.eye(DOF))
-        nav = dataclasses.replace(begun.nav, velocity=begun.nav.velocity + x[:3])
+        nav = dataclasses.replace(
+            begun.nav, velocity=begun.nav.velocity + x[:3], time_offset=begun.nav.time_offset + x[12]
+        )
         params = dataclasses.replace(PARAMS, gyro_noise=PARAMS.gyro_noise * jnp.exp(x[13]))
         begun = NavEstimate(nav, begun.covariance + jnp.diag(jnp.tile(x[6:12], 4)))
         rate = jnp.asarray([0.3, -0.2, 0.5]) + x[3:6]
@@ -254,6 +257,18 @@ def test_without_samples_the_derivative_by_the_motion_is_a_finite_difference() -
         high, low = (value(directions, side * h * direction, nothing)[0] for side in (1, -1))
         assert float(jnp.max(jnp.abs(slope))) > 1e-6
         np.testing.assert_allclose(slope, (high - low) / (2 * h), rtol=1e-6, atol=1e-8)
+
+
+def test_the_derivative_by_time_offset_and_noise_is_a_finite_difference(imu: ImuBatch) -> None:
+    """The time offset changes how long the first and the last interval are, and so their noise."""
+    value = quick_jit(along)
+    directions, h = jnp.eye(14)[12:], 1e-5
+    _, slopes = value(directions, jnp.zeros(14), imu)
+    for direction, slope in zip(directions, slopes, strict=True):
+        high, low = (value(directions, side * h * direction, imu)[0] for side in (1, -1))
+        largest = float(jnp.max(jnp.abs(slope)))
+        assert largest > 1e-7
+        np.testing.assert_allclose(slope, (high - low) / (2 * h), rtol=1e-5, atol=1e-5 * largest)
 
 
 def test_tangents_share_the_slopes_of_the_samples(imu: ImuBatch) -> None:
