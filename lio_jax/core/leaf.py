@@ -21,6 +21,8 @@ import jax.numpy as jnp
 from lio_jax.core.types import state_dtype
 
 Tuned = Literal["log", "linear", "turn"]
+LARGEST = 1e9
+"""No setting is larger than this in size: the powers of far larger numbers overflow."""
 _DECLARED = "lio_jax"
 T = TypeVar("T")
 
@@ -76,6 +78,9 @@ class Declared:
                 )
             if self.above is not None and number <= self.above:
                 return "must be greater than zero" if self.above == 0 else f"must be above {self.above:g}"
+        several = value if isinstance(value, list | tuple) else [value]
+        if any(isinstance(one, int | float) and abs(one) > LARGEST for one in several):
+            return f"must not exceed {LARGEST:g} in size"
         return ""
 
 

@@ -49,14 +49,18 @@ def unobserved_directions(registration: Any, nav: Any) -> list[str]:
 def weak_directions(registration: Any) -> NDArray[np.float64]:
     """Return the (6, k) directions that a scan match does not observe, rotation first, world axes.
 
-    Rotations are scaled to metres at a typical point, so that all six directions are comparable.
+    Rotations are scaled to metres at a typical point, so that all six directions are comparable. Where the
+    match's information is not finite, the directions are the axes.
     """
     missing = int(np.sum(registration.degenerate))
     R_world_lidar = Rotation.from_quat(
         np.asarray(registration.T_world_lidar.wxyz_xyz)[:4], scalar_first=True
     ).as_matrix()
     to_world = np.kron(np.eye(2), R_world_lidar)
-    information = to_world @ np.asarray(registration.information, np.float64) @ to_world.T
+    information = np.asarray(registration.information, np.float64)
+    if not np.isfinite(information).all():
+        return np.eye(6)[:, :missing]
+    information = to_world @ information @ to_world.T
     arm = np.sqrt(np.trace(information[:3, :3]) / max(np.trace(information[3:, 3:]), 1e-300)) + 1e-6
     scale = np.repeat([1 / arm, 1.0], 3)
     _, vectors = np.linalg.eigh(scale[:, None] * information * scale)

@@ -142,11 +142,15 @@ def keyframe_indices(poses: NDArray[np.float64], distance: float, angle: float) 
     return chosen
 
 
+_SINGULAR = 1e-12
+"""Least eigenvalue of a correlation matrix that is inverted."""
+
+
 def odometry_edges(poses: NDArray[np.float64], covariances: NDArray[np.float64]) -> list[G2oEdge]:
     """Return the edges between consecutive poses, under the assumption of independent errors.
 
     A relative pose T_i_j = T_i^-1 T_j has the covariance S_j + A S_i A', with A the adjoint of T_j_i. Where a
-    covariance is unknown, the edge gets standard deviations of 0.1 rad and 1 m.
+    covariance is unknown or singular, the edge gets standard deviations of 0.1 rad and 1 m.
 
     Args:
         poses: (n, 4, 4) poses, m.
@@ -157,9 +161,16 @@ def odometry_edges(poses: NDArray[np.float64], covariances: NDArray[np.float64])
     for i in range(len(poses) - 1):
         T_i_j = np.linalg.inv(poses[i]) @ poses[i + 1]
         covariance = covariances[i + 1] + carried(covariances[i], np.linalg.inv(T_i_j))
-        known = np.isfinite(covariance).all()
-        edges.append(G2oEdge(i, i + 1, T_i_j, np.linalg.inv(covariance if known else _LOOSE)))
+        edges.append(G2oEdge(i, i + 1, T_i_j, np.linalg.inv(covariance if _regular(covariance) else _LOOSE)))
     return edges
+
+
+def _regular(covariance: NDArray[np.float64]) -> bool:
+    """Return whether a covariance is finite and has an inverse."""
+    sigma = np.sqrt(np.diagonal(covariance))
+    if not (np.isfinite(covariance).all() and (sigma > 0).all()):
+        return False
+    return bool(np.linalg.eigvalsh(covariance / np.outer(sigma, sigma))[0] > _SINGULAR)
 
 
 FOLDER = "keyframes"

@@ -209,6 +209,12 @@ def test_at_rest_the_imus_axis_says_what_is_along() -> None:
     assert unobserved_directions(match((ALONG_X,)), turned) == ["across the IMU's x axis"]
 
 
+def test_information_that_is_not_finite_has_as_many_names() -> None:
+    found = match((ALONG_X,))
+    found.information = np.full((6, 6), np.inf)
+    assert unobserved_directions(found, MOVING) == ["in roll"]
+
+
 def samples(times: list[float]) -> ImuBatch:
     rows = np.zeros((len(times) + 2, 3))
     mask = np.arange(len(rows)) < len(times)

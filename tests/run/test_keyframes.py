@@ -1,6 +1,7 @@
 """Keyframes and the odometry chain between them."""
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.geometry import adjoint_of
@@ -45,7 +46,7 @@ def test_information_is_that_of_the_relative_pose():
     np.testing.assert_allclose(edge.information @ (second + A @ first @ A.T), np.eye(6), atol=1e-9)
 
 
-def test_unknown_covariance_gives_a_loose_edge():
-    covariances = np.stack([np.zeros((6, 6)), np.full((6, 6), np.nan)])
-    edge = odometry_edges(_poses([0.0, 0.0], [0.0, 1.0]), covariances)[0]
+@pytest.mark.parametrize("second", [np.full((6, 6), np.nan), np.zeros((6, 6)), np.ones((6, 6))])
+def test_unknown_or_singular_covariance_gives_a_loose_edge(second):
+    edge = odometry_edges(_poses([0.0, 0.0], [0.0, 1.0]), np.stack([np.zeros((6, 6)), second]))[0]
     np.testing.assert_array_equal(edge.information, np.diag([100.0] * 3 + [1.0] * 3))
