@@ -50,7 +50,7 @@ def weak_directions(registration: Any) -> NDArray[np.float64]:
     """Return the (6, k) directions that a scan match does not observe, rotation first, world axes.
 
     Rotations are scaled to metres at a typical point, so that all six directions are comparable. Where the
-    match's information is not finite, the directions are the axes.
+    match holds no usable information, the directions are the axes.
     """
     missing = int(np.sum(registration.degenerate))
     R_world_lidar = Rotation.from_quat(
@@ -58,12 +58,11 @@ def weak_directions(registration: Any) -> NDArray[np.float64]:
     ).as_matrix()
     to_world = np.kron(np.eye(2), R_world_lidar)
     information = np.asarray(registration.information, np.float64)
-    if not np.isfinite(information).all():
+    by_turn, by_move = np.trace(information[:3, :3]), np.trace(information[3:, 3:])
+    if not np.isfinite([*information.ravel(), *to_world.ravel()]).all() or min(by_turn, by_move) <= 0:
         return np.eye(6)[:, :missing]
-    information = to_world @ information @ to_world.T
-    arm = np.sqrt(np.trace(information[:3, :3]) / max(np.trace(information[3:, 3:]), 1e-300)) + 1e-6
-    scale = np.repeat([1 / arm, 1.0], 3)
-    _, vectors = np.linalg.eigh(scale[:, None] * information * scale)
+    scale = np.repeat([1 / (np.sqrt(by_turn / by_move) + 1e-6), 1.0], 3)
+    _, vectors = np.linalg.eigh(scale[:, None] * (to_world @ information @ to_world.T) * scale)
     return vectors[:, :missing]
 
 
