@@ -107,6 +107,28 @@ def parameter_covariance(result: Evaluated) -> NDArray[np.float64]:
     return np.asarray(inverse @ long_run @ inverse, np.float64)
 
 
+_CURVATURE_STEP = 1e-3
+"""Half the distance over which the change of a gradient is taken, in units of the vector."""
+_FLAT = 1e-6
+"""Curvature of a direction along which a likelihood does not fall: its sigma is 1,000 units."""
+
+
+def covariance_by_curvature(gradient: Callable[[Vector], Vector], x: Vector) -> NDArray[np.float64]:
+    """Return the covariance of a likelihood's maximum as the inverse of the curvature (observed information).
+
+    Args:
+        gradient: of minus the logarithm of the likelihood of all measurements, (p,) -> (p,). It is smooth.
+        x: (p,) the maximum.
+
+    Returns:
+        (p, p) covariance of the vector of parameters.
+    """
+    steps = _CURVATURE_STEP * np.eye(len(x))
+    rows = np.array([(gradient(x + step) - gradient(x - step)) / (2 * _CURVATURE_STEP) for step in steps])
+    values, vectors = np.linalg.eigh((rows + rows.T) / 2)
+    return np.asarray((vectors / np.maximum(values, _FLAT)) @ vectors.T, np.float64)
+
+
 _STRONGEST_CORRELATION = 0.97
 """Largest correlation of neighbouring scores from which the number of lags is found."""
 _MOST_LAGS = 1 / 4

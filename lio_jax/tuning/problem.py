@@ -65,6 +65,11 @@ class Problem:
         """Return whether the loss is a likelihood with a score for each scan."""
         return self.named.likelihood and not isinstance(self.loss, CorrectedLoss)
 
+    @property
+    def of_graph(self) -> bool:
+        """Return whether the loss is the likelihood of a graph, which is smooth and has no scores."""
+        return self.named.likelihood and isinstance(self.loss, CorrectedLoss)
+
     def first(self) -> NDArray[np.float64]:
         """Return the vector of the start, (p,)."""
         return np.asarray(self.free.first(), np.float64)

@@ -15,6 +15,7 @@ from lio_jax.data.trajectory import Trajectory
 from lio_jax.settings.settings import Settings
 from lio_jax.tuning.objective_names import LIKELIHOODS, SHORT
 from lio_jax.tuning.objectives import Objective
+from lio_jax.tuning.optimise import covariance_by_curvature
 from lio_jax.tuning.parameters import ParameterVector
 from lio_jax.tuning.problem import Problem, problem_of
 from lio_jax.tuning.session import Iterate, Session
@@ -32,7 +33,7 @@ class Tuned:
     values: dict[str, float]
     """Values found by component, such as ``imu.gyro_noise``."""
     intervals: dict[str, tuple[float, float]]
-    """95 % intervals by component; empty where the objective is no likelihood of the scans."""
+    """95 % intervals by component; empty where the objective is no likelihood."""
     best: Iterate
     """The evaluation that was taken."""
     history: tuple[Iterate, ...]
@@ -138,7 +139,7 @@ def tuned_by(problem: Problem, session: Session) -> Tuned:
     return Tuned(
         problem.tuned_settings(x),
         in_own_units(problem.free, x),
-        _intervals(problem.free, best),
+        _intervals(problem, best),
         best,
         tuple(session.history),
         tuple(problem.at_limit(x)),
@@ -153,12 +154,26 @@ def in_own_units(free: ParameterVector, x: NDArray[np.float64]) -> dict[str, flo
     return dict(zip(free.names, values.tolist(), strict=True))
 
 
-def _intervals(free: ParameterVector, iterate: Iterate) -> dict[str, tuple[float, float]]:
-    if iterate.sigma is None:
+def _intervals(problem: Problem, iterate: Iterate) -> dict[str, tuple[float, float]]:
+    x, free = np.asarray(iterate.x), problem.free
+    if iterate.sigma is not None:
+        sigma = np.asarray(iterate.sigma)
+    elif problem.of_graph:
+        sigma = np.sqrt(np.diag(covariance_by_curvature(_summed_gradient(problem), x)))
+    else:
         return {}
-    x, reach = np.asarray(iterate.x), 1.96 * np.asarray(iterate.sigma)
-    low, high = in_own_units(free, x - reach), in_own_units(free, x + reach)
+    low, high = in_own_units(free, x - 1.96 * sigma), in_own_units(free, x + 1.96 * sigma)
     return {name: (low[name], high[name]) for name in free.names}
+
+
+def _summed_gradient(problem: Problem) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Return the gradient of the sum over all scans, of which the loss is the mean."""
+
+    def gradient(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        result = problem.loss(x, problem.training)
+        return result.gradient * result.scans
+
+    return gradient
 
 
 def given_tree(settings: Settings) -> dict[str, Any]:

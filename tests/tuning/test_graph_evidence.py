@@ -27,7 +27,7 @@ from lio_jax.tuning.corrected import (
 )
 from lio_jax.tuning.evaluated import Evaluated
 from lio_jax.tuning.objectives import objective_named
-from lio_jax.tuning.optimise import Bounds, lbfgsb
+from lio_jax.tuning.optimise import Bounds, covariance_by_curvature, lbfgsb
 from lio_jax.tuning.replayed_graph import replayed_graph
 from tests.loops.drives import LEVER, poses_at, to_enu
 from tests.tuning.test_corrected import PATTERNS, run, stated
@@ -179,9 +179,17 @@ def test_it_finds_the_errors_of_odometry_and_receiver_without_truth():
 
     first = np.asarray(free.first())
     lbfgsb(evaluate, first, Bounds(first - 7.0, first + 7.0), 30)
-    found = dict(zip(free.names, np.exp(min(seen, key=lambda one: one[0])[1]), strict=True))
+    best = min(seen, key=lambda one: one[0])[1]
+    found = dict(zip(free.names, np.exp(best), strict=True))
     assert found["backend.odometry_scale"] == pytest.approx(SCALE, rel=0.3)
     assert np.sqrt(found["gps.min_variance"]) == pytest.approx(SIGMA, rel=0.15)
+
+    sigma = np.sqrt(np.diag(covariance_by_curvature(lambda x: 200 * evaluate(x).gradient, best)))
+    true = {"backend.odometry_scale": SCALE, "gps.min_variance": SIGMA**2}
+    errors = best - np.log([true[name] for name in free.names])
+    assert (np.abs(errors) < 3 * sigma).all()
+    # 80 fixes and 200 steps cannot tell more, and a tenth of the truth would be seen
+    assert ((sigma > 0.02) & (sigma < 0.5)).all()
 
 
 class Recorded:

@@ -21,6 +21,7 @@ from lio_jax.tuning.optimise import (
 )
 from lio_jax.tuning.parameters import free_parameters
 from lio_jax.tuning.session import HISTORY, Session
+from lio_jax.tuning.tune import tuned_by
 from tests.params import default_params
 
 WIDE = Bounds(np.full(2, -20.0), np.full(2, 20.0))
@@ -193,6 +194,36 @@ def test_the_best_of_a_session_that_looks_for_the_zero_has_the_smallest_gradient
     tuning = Session(problem(loss, scored=False), tmp_path, 50)
     tuning.run("stationary", BEST + 2.0, WIDE, 40, 0)
     np.testing.assert_allclose(tuning.best.x, BEST, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    "free", [["imu.gyro_noise", "lidar.range_sigma"], ["imu.*_noise", "lidar.range_sigma"]]
+)
+def test_the_likelihood_of_a_graph_has_intervals_by_its_curvature(tmp_path, free):
+    """Standard deviations of N normal samples have a relative error of 1 / sqrt(2 N) each.
+
+    A further parameter on which the likelihood does not depend gets an interval over all magnitudes.
+    """
+    free = free_parameters(default_params(), free)
+    known = [free.names.index(name) for name in ("imu.gyro_noise", "lidar.range_sigma")]
+
+    def loss(x, recordings):
+        fair, gradient = noise_likelihood(x[known]), np.zeros(len(x))
+        gradient[known] = fair.gradient
+        return Evaluated(fair.value, gradient, None, 0, len(SAMPLES))
+
+    graph = problem(loss, scored=False, of_graph=True, free=free)
+    graph.tuned_settings, graph.at_limit = lambda x: None, lambda x: ()
+    tuning, first = Session(graph, tmp_path, 50), np.zeros(len(free.names))
+    first[known] = BEST + 1.0
+    tuning.run("lbfgsb", first, Bounds(first - 9.0, first + 9.0), 40, 0)
+    found = tuned_by(graph, tuning)
+    for name, (low, high) in found.intervals.items():
+        if name == "imu.accel_noise":
+            assert high / low > 1e6
+        else:
+            assert np.log(high / low) == pytest.approx(2 * 1.96 / np.sqrt(2 * len(SAMPLES)), rel=1e-3)
+            assert low < found.values[name] < high
 
 
 def session(folder, loss=None, patience=50, observer=lambda iterate: None):
