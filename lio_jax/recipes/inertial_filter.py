@@ -154,7 +154,7 @@ class _Measured(eqx.Module):
 
     def measure(self, nav: NavState, last: Trial) -> Measurement:
         """Search matches, anew where the scan has moved, and linearise at ``nav``."""
-        association = self.match.associated(last.association, lidar_pose(nav))
+        association = self.match.associated(last.association, lidar_pose(nav), last.iteration)
         return self._linearised(nav, association, last.iteration)
 
     def again(self, nav: NavState, last: Trial) -> Measurement:

@@ -136,7 +136,7 @@ def _solve(max_steps: int, max_searches: Int32[Array, ""], match: ScanMatch[Any,
 
     def search(carry: tuple) -> tuple:
         count, _, end, equations = carry
-        association = match.associated(end.association, end.T_world_lidar)
+        association = match.associated(end.association, end.T_world_lidar, count)
 
         def iterate(carry: tuple) -> tuple:
             number, T, *_ = carry

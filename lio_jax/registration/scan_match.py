@@ -66,6 +66,10 @@ def associated(
     return jax.lax.cond(moved > distance, anew, lambda: last)
 
 
+_FREE_ITERATIONS = 8
+"""Iterations in which the points are matched anew after any motion beyond the distance. Most scans converge
+within 4."""
+
 _Points = TypeVar("_Points")
 """A scan's points, as a pytree of arrays."""
 """What the points were associated with, as a pytree of arrays."""
@@ -170,16 +174,26 @@ class ScanMatch(eqx.Module, Generic[_Points, _Found]):
         """Return the association before the first search."""
         return no_association(self.unmatched(), self.T_predicted)
 
-    def associated(self, last: Association[_Found], T_world_lidar: jaxlie.SE3) -> Association[_Found]:
+    def associated(
+        self, last: Association[_Found], T_world_lidar: jaxlie.SE3, iteration: Int32[Array, ""]
+    ) -> Association[_Found]:
         """Return the last association where the scan is still near it, else a new one.
 
-        Near means that the points have moved less than ``registration.reassociation_distance``.
+        Near means that the points have moved less than ``registration.reassociation_distance``. Where few
+        points lie on planes, a scan may go to and fro between two associations without end: after some
+        iterations the distance doubles with each further one, so that the solve converges for one of them.
+
+        Args:
+            last: the association so far.
+            T_world_lidar: the pose under trial.
+            iteration: how many iterations went before.
         """
         points = self.points_at(T_world_lidar)
+        further = jnp.exp2(jnp.maximum(iteration - _FREE_ITERATIONS, 0).astype(jnp.float32))
         return associated(
             last,
             lambda: self.associate(points, T_world_lidar),
             *self.together(points),
             T_world_lidar,
-            self.registration.reassociation_distance,
+            self.registration.reassociation_distance * further,
         )
