@@ -56,7 +56,7 @@ def recognise_messages(
         joining = _joining([cloud for cloud, _ in taken], each, config)
         if joining is not None:
             return _joined_reading([cloud for cloud, _ in taken], each, joining, config, where), joining
-    reading = recognise_clouds(firsts, config, where)
+    reading = recognise_clouds(firsts, config, where, known_whole=wanted == 1)
     return None if reading is None else (reading, None)
 
 

@@ -89,7 +89,11 @@ def first_clouds(clouds: Iterable[tuple[RawCloud, int]]) -> list[tuple[RawCloud,
 
 
 def recognise_clouds(
-    clouds: Iterable[tuple[RawCloud, int]], config: DataConfig, where: str, stamped: bool = True
+    clouds: Iterable[tuple[RawCloud, int]],
+    config: DataConfig,
+    where: str,
+    stamped: bool = True,
+    known_whole: bool = False,
 ) -> ScanReading | None:
     """Settle from the first clouds with points how clouds are read; None where there are no clouds.
 
@@ -98,6 +102,7 @@ def recognise_clouds(
         config: settings that override what is recognised.
         where: what is read, in errors.
         stamped: whether the clouds' stamps are recorded; false where they are only counted.
+        known_whole: whether the clouds are known to be scans, so that no note doubts it.
 
     Raises:
         UsageError: the settings name a number of beams that the points do not fit.
@@ -107,9 +112,8 @@ def recognise_clouds(
         return None
     reading = recognise_times(taken, config, stamped)
     beams, ring_notes = recognise_rings([cloud for cloud, _ in taken], config, where)
-    parts = _parts_note([_sectors(cloud.points) for cloud, _ in taken if len(cloud.points)])
-    notes = (*reading.notes, *ring_notes, *(parts if config.messages_per_scan != 1 else ()))
-    return replace(reading, beams=beams, notes=notes)
+    sectors = [] if known_whole else [_sectors(cloud.points) for cloud, _ in taken if len(cloud.points)]
+    return replace(reading, beams=beams, notes=(*reading.notes, *ring_notes, *_parts_note(sectors)))
 
 
 def recognise_times(

@@ -1,0 +1,113 @@
+"""A sensor that turns without a pause, and its messages as drivers cut them: parts of a turn or whole turns."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from tests.data import bags
+
+RINGS = 16
+XYZI = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
+LATENCY_NS = 2_000_000
+
+
+@dataclass(frozen=True)
+class Firings:
+    """All returns of a recording in the order of firing: columns of 16 beams."""
+
+    since_ns: np.ndarray
+    """(n,) ns from the recording's start, int64."""
+    points: np.ndarray
+    ring: np.ndarray
+    intensity: np.ndarray
+
+    def seen(self, kept: np.ndarray, begin_ns: int = 0) -> bags.Sweep:
+        """Return some of them, timed in s from ``begin_ns``."""
+        time = (self.since_ns[kept] - begin_ns) * 1e-9
+        return bags.Sweep(self.points[kept], time, self.ring[kept], self.intensity[kept])
+
+
+def firings(
+    turns: float = 12.0,
+    columns: int = 360,
+    period_ns: int = bags.PERIOD_NS,
+    start_deg: float = 0.0,
+    clockwise: bool = True,
+) -> Firings:
+    """Return the returns of a turning sensor in an oval room.
+
+    Args:
+        turns: number of turns.
+        columns: firings in a turn.
+        period_ns: duration of a turn, ns.
+        start_deg: azimuth atan2(y, x) of the first firing, deg.
+        clockwise: direction seen from above.
+    """
+    column = np.arange(round(turns * columns)).repeat(RINGS)
+    ring = np.tile(np.arange(RINGS), round(turns * columns))
+    turned = 2 * np.pi * column / columns * (-1 if clockwise else 1)
+    azimuth = np.radians(start_deg) + turned
+    elevation = np.radians(-15.0 + 2.0 * ring)
+    radius = 10.0 + 4.0 * np.cos(azimuth) ** 2 + 0.1 * ring
+    directions = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    points = (radius * np.stack(directions)).T.astype(np.float32)
+    return Firings(column * period_ns // columns, points, ring, (column % 200).astype(np.float32))
+
+
+def parts(
+    all_of_them: Firings, length_ns: int, kept: np.ndarray | None = None
+) -> list[tuple[int, np.ndarray]]:
+    """Cut firings into messages of one length: the begin of each from the recording's start, and its firings."""
+    place = all_of_them.since_ns // length_ns
+    cut = []
+    for number in range(int(place.max()) + 1):
+        inside = place == number
+        cut.append((number * length_ns, np.flatnonzero(inside if kept is None else inside & kept)))
+    return cut
+
+
+Driver = Callable[[Firings, int, int, np.ndarray, bool], bags.Message]
+"""Makes a message of its begin and end (ns from the recording's start) and its firings; ROS 2 or 1."""
+
+
+def velodyne(seen: Firings, begin_ns: int, end_ns: int, kept: np.ndarray, ros2: bool) -> bags.Message:
+    """velodyne_pointcloud with timestamp_first_packet: float32 seconds from the header stamp."""
+    cloud = seen.seen(kept, begin_ns)
+    return _message(bags.fill(bags.VELODYNE, cloud, cloud.time), begin_ns, end_ns, ros2)
+
+
+def velodyne_at_end(seen: Firings, begin_ns: int, end_ns: int, kept: np.ndarray, ros2: bool) -> bags.Message:
+    """velodyne_pointcloud as it is by default: the stamp is that of the last packet, times are negative."""
+    cloud = seen.seen(kept, end_ns)
+    return _message(bags.fill(bags.VELODYNE, cloud, cloud.time), end_ns, end_ns, ros2)
+
+
+def hesai(seen: Firings, begin_ns: int, end_ns: int, kept: np.ndarray, ros2: bool) -> bags.Message:
+    """HesaiLidar_ROS: float64 seconds since 1970."""
+    cloud = seen.seen(kept)
+    times = (bags.START_NS + seen.since_ns[kept]) * 1e-9
+    return _message(bags.fill(bags.HESAI, cloud, times), begin_ns, end_ns, ros2)
+
+
+def ouster(seen: Firings, begin_ns: int, end_ns: int, kept: np.ndarray, ros2: bool) -> bags.Message:
+    """The layout of ouster_ros: uint32 nanoseconds from the header stamp."""
+    cloud = seen.seen(kept)
+    return _message(bags.fill(bags.OUSTER, cloud, seen.since_ns[kept] - begin_ns), begin_ns, end_ns, ros2)
+
+
+def bare(seen: Firings, begin_ns: int, end_ns: int, kept: np.ndarray, ros2: bool) -> bags.Message:
+    """The bags of Cartographer's backpack: a PointCloud2 for each UDP packet, without times and rings."""
+    return _message(bags.fill(XYZI, seen.seen(kept)), begin_ns, end_ns, ros2)
+
+
+def recorded(
+    seen: Firings, cut: Iterable[tuple[int, np.ndarray]], length_ns: int, driver: Driver, ros2: bool = True
+) -> list[bags.Message]:
+    """Return the messages of a driver, one for each piece that was cut."""
+    return [driver(seen, begin, begin + length_ns, kept, ros2) for begin, kept in cut]
+
+
+def _message(cloud: np.ndarray, stamp_ns: int, end_ns: int, ros2: bool) -> bags.Message:
+    stamp = bags.START_NS + stamp_ns
+    return "/points", bags.START_NS + end_ns + LATENCY_NS, bags.cloud_message(stamp, cloud, ros2)

@@ -1,0 +1,384 @@
+"""Messages that hold parts of a turn become the scans of whole turns; nothing else is joined."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lio_jax.data.config import DataConfig
+from lio_jax.data.rosbag import RosbagSequence
+from lio_jax.data.sequence import LidarScan
+from tests.data import bags, part_recordings
+from tests.data.bag_recordings import AUTO
+from tests.data.part_recordings import Driver, Firings, firings, parts, recorded
+
+FIFTH_NS = bags.PERIOD_NS // 5
+
+
+def opened(path: Path, messages: Sequence[bags.Message], config: DataConfig = AUTO) -> RosbagSequence:
+    return RosbagSequence(bags.write_bag(path, messages), config)
+
+
+def joined_note(sequence: RosbagSequence) -> str:
+    (note,) = [note for note in sequence.info.notes if "joined" in note]
+    return note
+
+
+def is_joined(sequence: RosbagSequence) -> bool:
+    return any("joined" in note for note in sequence.info.notes)
+
+
+def check_same(scans: Sequence[LidarScan], expected: Sequence[LidarScan], time_ulps: int = 0) -> None:
+    assert len(scans) == len(expected)
+    for scan, whole in zip(scans, expected, strict=True):
+        assert scan.stamp_ns == whole.stamp_ns
+        np.testing.assert_array_equal(scan.points, whole.points)
+        np.testing.assert_array_equal(scan.ring, whole.ring)
+        np.testing.assert_array_equal(scan.intensity, whole.intensity)
+        np.testing.assert_array_max_ulp(scan.time, whole.time, max(time_ulps, 1))
+        if not time_ulps:
+            np.testing.assert_array_equal(scan.time, whole.time)
+        assert scan.duration == pytest.approx(whole.duration, abs=0 if not time_ulps else 1e-8)
+        assert scan.dropped == whole.dropped
+
+
+# the rounding of float32 seconds differs where they count from another instant
+DRIVERS: dict[str, tuple[Driver, int]] = {
+    "velodyne": (part_recordings.velodyne, 1),
+    "velodyne at end": (part_recordings.velodyne_at_end, 1),
+    "hesai": (part_recordings.hesai, 0),
+    "ouster": (part_recordings.ouster, 0),
+}
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
+def test_parts_are_joined_to_the_scans_of_whole_sweeps(tmp_path: Path, driver: str, name: str) -> None:
+    """Five messages a turn by velodyne_driver (npackets), or packet-wise clouds in the layouts of others."""
+    make, ulps = DRIVERS[driver]
+    seen, ros2 = firings(), bags.is_ros2(tmp_path / name)
+    whole = recorded(seen, parts(seen, bags.PERIOD_NS), bags.PERIOD_NS, make, ros2)
+    cut = recorded(seen, parts(seen, FIFTH_NS), FIFTH_NS, make, ros2)
+    expected = opened(tmp_path / f"whole{Path(name).suffix}", whole)
+    sequence = opened(tmp_path / name, cut)
+    assert not is_joined(expected)
+    assert joined_note(sequence) == (
+        "each message holds a part of a turn: 5 messages are joined to a scan of 0.1 s, which starts at 0 deg "
+        "of azimuth; --set config.data.messages_per_scan=1 reads each message as a scan"
+    )
+    scans = list(expected.scans())
+    check_same(list(sequence.scans()), scans, ulps)
+    assert sequence.info.scan_count == len(scans) == 12
+    check_same(list(sequence.scans(4, 3)), scans[4:7], ulps)
+    check_same(list(sequence.scans(10)), scans[10:], ulps)
+    assert list(sequence.scans(12)) == []
+    assert list(sequence.scans(0, 0)) == []
+    assert sequence.warnings_so_far == ()
+
+
+def test_organised_clouds_of_parts(tmp_path: Path) -> None:
+    """velodyne_pointcloud with organize_cloud: rows of firings, columns of lasers, NaN where nothing returned."""
+    seen = firings()
+    silent = np.arange(len(seen.points)) % 7 == 3
+
+    def organised(of: Firings, begin: int, end: int, kept: np.ndarray, ros2: bool) -> bags.Message:
+        cloud = of.seen(kept, begin)
+        filled = bags.fill(bags.VELODYNE, cloud, cloud.time)
+        for axis in "xyz":
+            filled[axis][silent[kept]] = np.nan
+        stamp, height = bags.START_NS + begin, len(kept) // part_recordings.RINGS
+        message = bags.cloud_message(stamp, filled, ros2, height=height)
+        return "/velodyne_points", bags.START_NS + end + 2_000_000, message
+
+    whole = recorded(seen, parts(seen, bags.PERIOD_NS), bags.PERIOD_NS, organised)
+    cut = recorded(seen, parts(seen, FIFTH_NS), FIFTH_NS, organised)
+    expected = list(opened(tmp_path / "whole.db3", whole).scans())
+    assert expected[3].dropped > 0
+    check_same(list(opened(tmp_path / "a.db3", cut).scans()), expected, 1)
+
+
+@pytest.mark.parametrize("clockwise", [True, False])
+@pytest.mark.parametrize("number", [2, 3, 4, 10, 36])
+def test_any_number_of_messages_in_either_direction(tmp_path: Path, number: int, clockwise: bool) -> None:
+    seen = firings(clockwise=clockwise)
+    length = bags.PERIOD_NS // number
+    length += length * number < bags.PERIOD_NS
+    messages = recorded(seen, parts(seen, length), length, part_recordings.hesai)
+    sequence = opened(tmp_path / "a.db3", messages)
+    assert f": {number} messages are joined to a scan of 0.1 s" in joined_note(sequence)
+    scans = list(sequence.scans())
+    assert [len(scan.points) for scan in scans] == [360 * part_recordings.RINGS] * 12
+
+
+def test_packets_that_do_not_divide_a_turn(tmp_path: Path) -> None:
+    """A VLP-16 at 10 Hz, one message a UDP packet: 24 firings in 1.327 ms, 75.35 packets in a turn."""
+    columns, packet_ns = 1808, 1_327_104
+    seen = firings(turns=8, columns=columns)
+    sequence = opened(
+        tmp_path / "a.db3", recorded(seen, parts(seen, packet_ns), packet_ns, part_recordings.velodyne)
+    )
+    assert "75.35 messages are joined to a scan of 0.1 s" in joined_note(sequence)
+    scans = list(sequence.scans())
+    assert sum(len(scan.points) for scan in scans) == len(seen.points)
+    assert len(scans) == 8
+    for number, scan in enumerate(scans):
+        # a sweep starts with the packet whose middle is the first behind the start
+        assert abs(scan.stamp_ns - bags.START_NS - number * bags.PERIOD_NS) <= 0.51 * packet_ns
+        since = scan.stamp_ns - bags.START_NS
+        mine = seen.since_ns[np.searchsorted(seen.since_ns, since - 1000) :][: len(scan.points)]
+        np.testing.assert_allclose(scan.time, (mine - since) * 1e-9, atol=1e-7)
+
+
+def test_packets_without_times_and_rings(tmp_path: Path) -> None:
+    """The bags of Cartographer's backpack: x, y, z and intensity of each UDP packet, stamped at its start."""
+    seen = firings(columns=1808)
+    packet_ns = 1_327_104
+    messages = recorded(seen, parts(seen, packet_ns), packet_ns, part_recordings.bare)
+    sequence = opened(tmp_path / "a.bag", messages, AUTO)
+    assert any("rin" in note and "16 beams" in note for note in sequence.info.notes)
+    scan = list(sequence.scans())[3]
+    begin = np.searchsorted(seen.since_ns, scan.stamp_ns - bags.START_NS - 1000)
+    kept = slice(begin, begin + len(scan.points))
+    np.testing.assert_array_equal(scan.points, seen.points[kept])
+    np.testing.assert_array_equal(scan.ring, seen.ring[kept])
+    truth = (seen.since_ns[kept] - (scan.stamp_ns - bags.START_NS)) * 1e-9
+    np.testing.assert_allclose(scan.time, truth, atol=2e-5)
+
+
+def test_a_lost_message_shortens_its_own_sweep_alone(tmp_path: Path) -> None:
+    seen = firings()
+    cut = parts(seen, FIFTH_NS)
+    whole = list(opened(tmp_path / "w.db3", recorded(seen, cut, FIFTH_NS, part_recordings.hesai)).scans())
+    lost = [7, 20, 34, 41, 42, 43, 44, 45, 46]
+    left = [piece for number, piece in enumerate(cut) if number not in lost]
+    sequence = opened(tmp_path / "a.db3", recorded(seen, left, FIFTH_NS, part_recordings.hesai))
+    scans = list(sequence.scans())
+    assert sequence.info.scan_count == len(scans) == 12
+    counts = np.array([len(scan.points) for scan in scans]) / (72 * part_recordings.RINGS)
+    np.testing.assert_array_equal(counts, [5, 4, 5, 5, 4, 5, 4, 5, 1, 4, 5, 5])
+    for number in (0, 2, 3, 5, 7, 10, 11):
+        check_same([scans[number]], [whole[number]])
+    # the second sweep has no third part, the fifth begins late
+    first = seen.since_ns[len(seen.points) // 12 * 4 + 72 * part_recordings.RINGS]
+    assert scans[4].stamp_ns == pytest.approx(bags.START_NS + first, abs=300)
+    assert scans[1].stamp_ns == whole[1].stamp_ns
+    np.testing.assert_array_equal(scans[1].points[: 144 * 16], whole[1].points[: 144 * 16])
+    np.testing.assert_array_equal(scans[1].points[144 * 16 :], whole[1].points[216 * 16 :])
+    np.testing.assert_array_equal(scans[1].time[144 * 16 :], whole[1].time[216 * 16 :])
+    check_same(list(sequence.scans(8, 2)), scans[8:10])
+
+
+def test_a_gap_of_many_turns_joins_nothing(tmp_path: Path) -> None:
+    """A recorder that lost 3.46 s: the message behind the gap lies in the sector after that before it."""
+    seen = firings(turns=45)
+    cut = parts(seen, FIFTH_NS)
+    left = cut[:27] + cut[200:]
+    sequence = opened(tmp_path / "a.db3", recorded(seen, left, FIFTH_NS, part_recordings.ouster))
+    scans = list(sequence.scans())
+    assert max(scan.duration for scan in scans) < 0.1
+    assert len(scans) == 6 + 5
+
+
+def test_duplicates_and_late_messages_are_left_out(tmp_path: Path) -> None:
+    seen = firings()
+    messages = recorded(seen, parts(seen, FIFTH_NS), FIFTH_NS, part_recordings.hesai)
+    expected = list(opened(tmp_path / "w.db3", messages).scans())
+    messages.insert(23, messages[22])
+    messages.insert(40, messages[31])
+    sequence = opened(tmp_path / "a.db3", messages)
+    check_same(list(sequence.scans()), expected)
+    duplicate, late = sequence.warnings_so_far
+    assert "a: message 23 has the same stamp as a: message 22" in duplicate
+    assert "a: message 40" in late
+    assert "out of order" in late
+
+
+def test_a_damaged_message_is_a_lost_one(tmp_path: Path) -> None:
+    seen = firings()
+    messages = recorded(seen, parts(seen, FIFTH_NS), FIFTH_NS, part_recordings.hesai)
+    messages[26][2].height = 50_000
+    sequence = opened(tmp_path / "a.db3", messages)
+    counts = [len(scan.points) // (72 * part_recordings.RINGS) for scan in sequence.scans()]
+    assert counts == [5, 5, 5, 5, 5, 4, 5, 5, 5, 5, 5, 5]
+    assert "a: message 26 cannot be read and was skipped" in sequence.warnings_so_far[0]
+
+
+def test_a_recording_that_begins_inside_a_sweep(tmp_path: Path) -> None:
+    """Messages begin at the same azimuths in each turn; one of them is straight ahead, where drivers cut."""
+    seen = firings()
+    cut = parts(seen, FIFTH_NS)
+    whole = list(opened(tmp_path / "w.db3", recorded(seen, cut, FIFTH_NS, part_recordings.hesai)).scans())
+    more = opened(tmp_path / "more.db3", recorded(seen, cut[2:], FIFTH_NS, part_recordings.hesai))
+    scans = list(more.scans())
+    check_same(scans[1:], whole[1:])
+    assert len(scans[0].points) == 3 * 72 * part_recordings.RINGS
+    sliver = opened(tmp_path / "less.db3", recorded(seen, cut[3:-3], FIFTH_NS, part_recordings.hesai))
+    check_same(list(sliver.scans()), whole[1:-1])
+    assert sliver.info.scan_count == 10
+
+
+def test_times_that_run_on_show_where_a_sweep_starts(tmp_path: Path) -> None:
+    """A driver that cuts a sweep into messages with one stamp, times counted from the sweep's start."""
+    seen = firings(start_deg=-130.0)
+
+    def one_stamp(of: Firings, begin: int, end: int, kept: np.ndarray, ros2: bool) -> bags.Message:
+        sweep = (begin + 2 * FIFTH_NS) // bags.PERIOD_NS * bags.PERIOD_NS - 2 * FIFTH_NS
+        cloud = bags.fill(bags.OUSTER, of.seen(kept), of.since_ns[kept] - sweep)
+        return "/points", bags.START_NS + end, bags.cloud_message(bags.START_NS + sweep, cloud, ros2)
+
+    cut = parts(seen, FIFTH_NS)[3:]
+    sequence = opened(tmp_path / "a.db3", recorded(seen, cut, FIFTH_NS, one_stamp))
+    scans = list(sequence.scans())
+    assert len(scans) == 12
+    for number, scan in enumerate(scans[:-1]):
+        assert scan.stamp_ns == bags.START_NS + (number + 1) * bags.PERIOD_NS - 2 * FIFTH_NS
+        assert len(scan.points) == 360 * part_recordings.RINGS
+        np.testing.assert_allclose(scan.time.max(), 0.1 * 359 / 360, atol=1e-6)
+
+
+def test_messages_are_scans_if_the_settings_say_so(tmp_path: Path) -> None:
+    seen = firings()
+    messages = recorded(seen, parts(seen, FIFTH_NS), FIFTH_NS, part_recordings.hesai)
+    sequence = opened(tmp_path / "a.db3", messages, DataConfig(messages_per_scan=1))
+    assert sequence.info.scan_count == len(list(sequence.scans())) == 60
+    assert not any("joined" in note or "part of a sweep" in note for note in sequence.info.notes)
+
+
+def test_any_number_is_joined_by_hand(tmp_path: Path) -> None:
+    """A Livox sensor whose driver publishes at 50 Hz, read as scans of 0.1 s; the 8th message is lost."""
+    seen = firings()
+    ahead = seen.points[:, 0] > np.abs(seen.points[:, 1])
+
+    def livox(of: Firings, begin: int, end: int, kept: np.ndarray, ros2: bool) -> bags.Message:
+        cloud = bags.fill(bags.LIVOX_OFFSET_CLOUD, of.seen(kept), of.since_ns[kept] - begin)
+        stamp = bags.START_NS + begin
+        return "/livox/lidar", stamp + FIFTH_NS, bags.custom_message(stamp, cloud, ros2)
+
+    cut = [(begin, kept[::8]) for begin, kept in parts(seen, FIFTH_NS)]
+    del cut[7]
+    messages = recorded(seen, cut, FIFTH_NS, livox, ros2=False)
+    alone = opened(tmp_path / "a.bag", messages)
+    assert not is_joined(alone)
+    assert alone.info.scan_count == 59
+    sequence = opened(tmp_path / "b.bag", messages, DataConfig(messages_per_scan=5))
+    scans = list(sequence.scans())
+    assert joined_note(sequence).endswith("(config.data.messages_per_scan)")
+    assert [round(len(scan.points) / len(cut[0][1])) for scan in scans] == [5, 4, *[5] * 10]
+    for number, scan in enumerate(scans):
+        assert scan.stamp_ns == bags.START_NS + number * bags.PERIOD_NS
+    assert scans[3].time.max() == pytest.approx(0.1, abs=5e-4)
+    assert ahead.any()
+
+
+def test_a_number_that_is_no_turn_is_joined_by_hand(tmp_path: Path) -> None:
+    seen = firings()
+    messages = recorded(seen, parts(seen, FIFTH_NS), FIFTH_NS, part_recordings.hesai)
+    sequence = opened(tmp_path / "a.db3", messages, DataConfig(messages_per_scan=3))
+    scans = list(sequence.scans())
+    assert len(scans) == sequence.info.scan_count == 20
+    assert {len(scan.points) for scan in scans} == {3 * 72 * part_recordings.RINGS}
+
+
+def full_sweeps() -> list[bags.Message]:
+    seen = firings()
+    return recorded(seen, parts(seen, bags.PERIOD_NS), bags.PERIOD_NS, part_recordings.velodyne)
+
+
+def blocked(share: float) -> list[bags.Message]:
+    """Whole sweeps of a sensor of which a vehicle covers a share."""
+    seen = firings()
+    azimuth = np.arctan2(seen.points[:, 1], seen.points[:, 0]) / (2 * np.pi) % 1.0
+    cut = parts(seen, bags.PERIOD_NS, azimuth > share)
+    return recorded(seen, cut, bags.PERIOD_NS, part_recordings.velodyne)
+
+
+def solid_state(period_ns: int) -> list[bags.Message]:
+    """A sensor with 120 deg of view that looks to and fro, as it is published at 10 or 50 Hz."""
+    seen = firings(turns=12 * bags.PERIOD_NS / period_ns, period_ns=period_ns)
+    cut = parts(seen, period_ns, seen.points[:, 0] > 0.5 * np.linalg.norm(seen.points[:, :2], axis=1))
+    return recorded(seen, cut, period_ns, part_recordings.hesai)
+
+
+def strips() -> list[bags.Message]:
+    """A view of 120 deg in five strips from left to right, again and again."""
+    seen = firings(turns=40, period_ns=3 * bags.PERIOD_NS)
+    length = 24 * 3 * bags.PERIOD_NS // 360
+    strips = [piece for number, piece in enumerate(parts(seen, length)) if number % 15 < 5]
+    moved = [
+        (number * length, kept - (begin - number * length) * 360 // (3 * bags.PERIOD_NS) * 0, begin)
+        for number, (begin, kept) in enumerate(strips)
+    ]
+    messages = []
+    for at, kept, begin in moved:
+        times = (bags.START_NS + seen.since_ns[kept] - begin + at) * 1e-9
+        cloud = bags.fill(bags.HESAI, seen.seen(kept), times)
+        stamp = bags.START_NS + at
+        messages.append(("/points", stamp + length, bags.cloud_message(stamp, cloud)))
+    return messages
+
+
+def front_and_back() -> list[bags.Message]:
+    """Two solid-state sensors of 140 deg, ahead and behind, whose messages take turns on one topic."""
+    seen = firings(turns=40)
+    ahead = seen.points[:, 0] > np.cos(np.radians(70)) * np.linalg.norm(seen.points[:, :2], axis=1)
+    behind = seen.points[:, 0] < -np.cos(np.radians(70)) * np.linalg.norm(seen.points[:, :2], axis=1)
+    messages = []
+    for number in range(40):
+        kept = np.flatnonzero((seen.since_ns // bags.PERIOD_NS == number) & (behind if number % 2 else ahead))
+        # each scans its view in 50 ms
+        kept = kept[np.argsort(seen.points[kept, 2], kind="stable")]
+        times = bags.START_NS * 1e-9 + 0.05 * number + np.linspace(0.0, 0.05, len(kept))
+        cloud = bags.fill(bags.HESAI, seen.seen(kept), times)
+        stamp = bags.START_NS + number * 50_000_000
+        messages.append(("/points", stamp + 52_000_000, bags.cloud_message(stamp, cloud)))
+    return messages
+
+
+@pytest.mark.parametrize(
+    "messages",
+    [
+        full_sweeps,
+        lambda: blocked(0.25),
+        lambda: blocked(0.7),
+        lambda: solid_state(bags.PERIOD_NS),
+        lambda: solid_state(bags.PERIOD_NS // 5),
+        strips,
+        front_and_back,
+    ],
+    ids=["full", "quarter blocked", "mostly blocked", "solid 10 Hz", "solid 50 Hz", "strips", "two sensors"],
+)
+def test_what_is_no_part_of_a_turn_is_not_joined(tmp_path: Path, messages) -> None:  # noqa: ANN001
+    made = messages()
+    sequence = opened(tmp_path / "a.db3", made)
+    assert not is_joined(sequence)
+    assert sequence.info.scan_count == len(made)
+    assert len(list(sequence.scans())) == len(made)
+
+
+def test_a_blocked_quarter_does_not_shift_the_sweeps(tmp_path: Path) -> None:
+    """A fifth of the turn and a half of another see the vehicle alone, and give no points."""
+    seen = firings()
+    azimuth = -np.arctan2(seen.points[:, 1], seen.points[:, 0]) / (2 * np.pi) % 1.0
+    free = (azimuth < 0.2) | (azimuth > 0.5)
+    cut = parts(seen, FIFTH_NS, free)
+    sequence = opened(tmp_path / "a.db3", recorded(seen, cut, FIFTH_NS, part_recordings.ouster))
+    assert ": 5 messages" in joined_note(sequence)
+    scans = list(sequence.scans())
+    assert len(scans) == 12
+    for number, scan in enumerate(scans):
+        mine = free & (seen.since_ns // bags.PERIOD_NS == number)
+        np.testing.assert_array_equal(scan.points, seen.points[mine])
+        since = scan.stamp_ns - bags.START_NS
+        np.testing.assert_allclose(scan.time, (seen.since_ns[mine] - since) * 1e-9, atol=1e-8)
+
+
+def test_a_part_of_the_recording_counts_its_own_sweeps(tmp_path: Path) -> None:
+    seen = firings()
+    messages = recorded(seen, parts(seen, FIFTH_NS), FIFTH_NS, part_recordings.hesai)
+    sequence = opened(tmp_path / "a.db3", messages)
+    whole = list(sequence.scans())
+    part = sequence.within(bags.START_NS + 4 * bags.PERIOD_NS + FIFTH_NS, bags.START_NS + 9 * bags.PERIOD_NS)
+    assert part.info.scan_count == 12
+    check_same(list(part.scans()), whole[4:9][:-1] if len(list(part.scans())) == 4 else whole[4:9])
+    check_same(list(part.scans(1, 2)), whole[5:7])
