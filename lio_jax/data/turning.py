@@ -24,8 +24,9 @@ _STEADY = 0.9
 """Least length of the mean of unit vectors, one for each message's deviation from a constant rate."""
 _STAGGER = np.deg2rad(25.0)
 """Azimuth by which the beams of one firing may differ, rad; those of an HDL-64E differ by about 20 deg."""
-_ALIGNED = 0.6
-"""Least length of the mean of unit vectors where messages begin at the same azimuths in each turn."""
+_ALIGNED, _WHOLE = 0.4, 0.005
+"""Where messages begin at the same azimuths in each turn: least length of the mean of unit vectors, which
+covered sectors shorten, and share by which their number in a turn may differ from a whole one."""
 _USUAL_STARTS = (0.0, 0.5, 0.25, -0.25)
 """Azimuths atan2(y, x) at which drivers cut sweeps, turns: ahead (Velodyne, RoboSense), behind (Ouster), left
 (Hesai), right."""
@@ -165,8 +166,15 @@ def recognised_turning(seen: Sequence[SeenMessage]) -> Turning | None:
         return None
     if not _moves_within(seen, rate, half_turns):
         return None
+    # firings are sparse in small messages: one step says less than their mean
+    steps = np.diff(seconds)
+    step = float(np.mean(steps[(steps > 0.5 * step) & (steps < 1.5 * step)]))
     messages = 1.0 / (abs(rate) * step)
-    return Turning(rate, messages, _start(seen, rate, messages))
+    start, aligned = _start(seen, rate, messages)
+    if aligned:
+        messages = float(round(messages))
+        rate = float(np.sign(rate)) / (messages * step)
+    return Turning(rate, messages, start)
 
 
 def _constant_rate(
@@ -195,8 +203,10 @@ def _moves_within(seen: Sequence[SeenMessage], rate: float, half_turns: bool) ->
     return not half_turns or abs(float(np.median([one.order for one in seen]))) > 0.5
 
 
-def _start(seen: Sequence[SeenMessage], rate: float, messages: float) -> float:
+def _start(seen: Sequence[SeenMessage], rate: float, messages: float) -> tuple[float, bool]:
     """Return the azimuth (rad) where sweeps start: where times start again, or where a driver would cut.
+
+    The second value says whether the messages begin at the same azimuths in each turn.
 
     If the messages begin at the same azimuths in each turn, a sweep starts at one of them: at one of the
     usual starts if there is one, at the first message's begin otherwise. If they do not, no azimuth is
@@ -206,18 +216,19 @@ def _start(seen: Sequence[SeenMessage], rate: float, messages: float) -> float:
     begins = np.array([one.arc.begin if sign > 0 else one.arc.begin + one.arc.width for one in seen])
     # in turns, growing with time
     begins = sign * begins / _TURN
-    restarting = np.array([one.restarts for one in seen])
-    if restarting.any():
-        mean = np.mean(np.exp(1j * _TURN * begins[restarting]))
-        return sign * float(np.angle(mean))
     whole = round(messages)
     mean = np.mean(np.exp(1j * _TURN * whole * begins))
+    aligned = bool(abs(mean) >= _ALIGNED) and abs(messages / whole - 1.0) < _WHOLE
+    restarting = np.array([one.restarts for one in seen])
+    if restarting.any():
+        restart = np.mean(np.exp(1j * _TURN * begins[restarting]))
+        return sign * float(np.angle(restart)), aligned
     first = float(begins[0])
-    if abs(mean) >= _ALIGNED:
+    if aligned:
         mean_begin = float(np.angle(mean)) / (_TURN * whole)
         around = (begins - mean_begin + 0.5 / whole) % (1 / whole) - 0.5 / whole
         # missing returns make a message begin late, never early
-        edge = mean_begin + float(np.percentile(around, 10))
+        edge = mean_begin + float(np.percentile(around[np.abs(around) < 0.3 / whole], 10))
         middle = sign * seen[0].arc.middle / _TURN
         first = edge + np.floor((middle - edge) * whole) / whole
         reach = min(0.25 / whole, 5.0 / 360.0)
@@ -226,7 +237,7 @@ def _start(seen: Sequence[SeenMessage], rate: float, messages: float) -> float:
             nearest = [edge + round((azimuth - edge) * whole) / whole for azimuth in usual]
             fitting = [n for n, azimuth in zip(nearest, usual, strict=True) if _apart(n, azimuth) <= reach]
             first = fitting[0] if fitting else first
-    return float(sign * first * _TURN)
+    return float(sign * first * _TURN), aligned
 
 
 def _apart(one: float, other: float) -> float:

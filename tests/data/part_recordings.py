@@ -1,4 +1,4 @@
-"""A sensor that turns without a pause, and its messages as drivers cut them: parts of a turn or whole turns."""
+"""A sensor that turns without a pause, and its messages as drivers cut them: parts of a turn or turns."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -58,7 +58,7 @@ def firings(
 def parts(
     all_of_them: Firings, length_ns: int, kept: np.ndarray | None = None
 ) -> list[tuple[int, np.ndarray]]:
-    """Cut firings into messages of one length: the begin of each from the recording's start, and its firings."""
+    """Cut firings into messages of one length: the begin of each (ns from the first firing) and its firings."""
     place = all_of_them.since_ns // length_ns
     cut = []
     for number in range(int(place.max()) + 1):

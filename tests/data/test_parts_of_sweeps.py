@@ -1,6 +1,6 @@
 """Messages that hold parts of a turn become the scans of whole turns; nothing else is joined."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,14 +32,12 @@ def is_joined(sequence: RosbagSequence) -> bool:
 def check_same(scans: Sequence[LidarScan], expected: Sequence[LidarScan], time_ulps: int = 0) -> None:
     assert len(scans) == len(expected)
     for scan, whole in zip(scans, expected, strict=True):
-        assert scan.stamp_ns == whole.stamp_ns
+        assert abs(scan.stamp_ns - whole.stamp_ns) <= 2 * time_ulps
         np.testing.assert_array_equal(scan.points, whole.points)
         np.testing.assert_array_equal(scan.ring, whole.ring)
         np.testing.assert_array_equal(scan.intensity, whole.intensity)
-        np.testing.assert_array_max_ulp(scan.time, whole.time, max(time_ulps, 1))
-        if not time_ulps:
-            np.testing.assert_array_equal(scan.time, whole.time)
-        assert scan.duration == pytest.approx(whole.duration, abs=0 if not time_ulps else 1e-8)
+        np.testing.assert_allclose(scan.time, whole.time, rtol=0.0, atol=8e-9 * time_ulps)
+        assert scan.duration == pytest.approx(whole.duration, rel=0.0, abs=8e-9 * time_ulps)
         assert scan.dropped == whole.dropped
 
 
@@ -64,8 +62,8 @@ def test_parts_are_joined_to_the_scans_of_whole_sweeps(tmp_path: Path, driver: s
     sequence = opened(tmp_path / name, cut)
     assert not is_joined(expected)
     assert joined_note(sequence) == (
-        "each message holds a part of a turn: 5 messages are joined to a scan of 0.1 s, which starts at 0 deg "
-        "of azimuth; --set config.data.messages_per_scan=1 reads each message as a scan"
+        "each message holds a part of a turn: 5 messages are joined to a scan of 0.1 s, which starts at 0 "
+        "deg of azimuth; --set config.data.messages_per_scan=1 reads each message as a scan"
     )
     scans = list(expected.scans())
     check_same(list(sequence.scans()), scans, ulps)
@@ -78,7 +76,7 @@ def test_parts_are_joined_to_the_scans_of_whole_sweeps(tmp_path: Path, driver: s
 
 
 def test_organised_clouds_of_parts(tmp_path: Path) -> None:
-    """velodyne_pointcloud with organize_cloud: rows of firings, columns of lasers, NaN where nothing returned."""
+    """velodyne_pointcloud with organize_cloud: a row a firing, a column a laser, NaN without a return."""
     seen = firings()
     silent = np.arange(len(seen.points)) % 7 == 3
 
@@ -103,7 +101,6 @@ def test_organised_clouds_of_parts(tmp_path: Path) -> None:
 def test_any_number_of_messages_in_either_direction(tmp_path: Path, number: int, clockwise: bool) -> None:
     seen = firings(clockwise=clockwise)
     length = bags.PERIOD_NS // number
-    length += length * number < bags.PERIOD_NS
     messages = recorded(seen, parts(seen, length), length, part_recordings.hesai)
     sequence = opened(tmp_path / "a.db3", messages)
     assert f": {number} messages are joined to a scan of 0.1 s" in joined_note(sequence)
@@ -134,7 +131,7 @@ def test_packets_without_times_and_rings(tmp_path: Path) -> None:
     """The bags of Cartographer's backpack: x, y, z and intensity of each UDP packet, stamped at its start."""
     seen = firings(columns=1808)
     packet_ns = 1_327_104
-    messages = recorded(seen, parts(seen, packet_ns), packet_ns, part_recordings.bare)
+    messages = recorded(seen, parts(seen, packet_ns), packet_ns, part_recordings.bare, ros2=False)
     sequence = opened(tmp_path / "a.bag", messages, AUTO)
     assert any("rin" in note and "16 beams" in note for note in sequence.info.notes)
     scan = list(sequence.scans())[3]
@@ -143,7 +140,8 @@ def test_packets_without_times_and_rings(tmp_path: Path) -> None:
     np.testing.assert_array_equal(scan.points, seen.points[kept])
     np.testing.assert_array_equal(scan.ring, seen.ring[kept])
     truth = (seen.since_ns[kept] - (scan.stamp_ns - bags.START_NS)) * 1e-9
-    np.testing.assert_allclose(scan.time, truth, atol=2e-5)
+    # the first firing comes up to one firing after the stamp
+    np.testing.assert_allclose(scan.time, truth, atol=bags.PERIOD_NS * 1e-9 / 1808)
 
 
 def test_a_lost_message_shortens_its_own_sweep_alone(tmp_path: Path) -> None:
@@ -156,7 +154,7 @@ def test_a_lost_message_shortens_its_own_sweep_alone(tmp_path: Path) -> None:
     scans = list(sequence.scans())
     assert sequence.info.scan_count == len(scans) == 12
     counts = np.array([len(scan.points) for scan in scans]) / (72 * part_recordings.RINGS)
-    np.testing.assert_array_equal(counts, [5, 4, 5, 5, 4, 5, 4, 5, 1, 4, 5, 5])
+    np.testing.assert_array_equal(counts, [5, 4, 5, 5, 4, 5, 4, 5, 1, 3, 5, 5])
     for number in (0, 2, 3, 5, 7, 10, 11):
         check_same([scans[number]], [whole[number]])
     # the second sweep has no third part, the fifth begins late
@@ -184,14 +182,15 @@ def test_duplicates_and_late_messages_are_left_out(tmp_path: Path) -> None:
     seen = firings()
     messages = recorded(seen, parts(seen, FIFTH_NS), FIFTH_NS, part_recordings.hesai)
     expected = list(opened(tmp_path / "w.db3", messages).scans())
-    messages.insert(23, messages[22])
-    messages.insert(40, messages[31])
+    again, late = messages[22], messages[31]
+    messages.insert(23, (again[0], again[1] + 1_000_000, again[2]))
+    messages.insert(40, (late[0], messages[39][1] + 1_000_000, late[2]))
     sequence = opened(tmp_path / "a.db3", messages)
     check_same(list(sequence.scans()), expected)
-    duplicate, late = sequence.warnings_so_far
+    duplicate, skipped = sequence.warnings_so_far
     assert "a: message 23 has the same stamp as a: message 22" in duplicate
-    assert "a: message 40" in late
-    assert "out of order" in late
+    assert "a: message 40" in skipped
+    assert "out of order" in skipped
 
 
 def test_a_damaged_message_is_a_lost_one(tmp_path: Path) -> None:
@@ -230,8 +229,9 @@ def test_times_that_run_on_show_where_a_sweep_starts(tmp_path: Path) -> None:
     cut = parts(seen, FIFTH_NS)[3:]
     sequence = opened(tmp_path / "a.db3", recorded(seen, cut, FIFTH_NS, one_stamp))
     scans = list(sequence.scans())
-    assert len(scans) == 12
-    for number, scan in enumerate(scans[:-1]):
+    # two parts of the last sweep are less than half
+    assert len(scans) == 11
+    for number, scan in enumerate(scans):
         assert scan.stamp_ns == bags.START_NS + (number + 1) * bags.PERIOD_NS - 2 * FIFTH_NS
         assert len(scan.points) == 360 * part_recordings.RINGS
         np.testing.assert_allclose(scan.time.max(), 0.1 * 359 / 360, atol=1e-6)
@@ -248,7 +248,6 @@ def test_messages_are_scans_if_the_settings_say_so(tmp_path: Path) -> None:
 def test_any_number_is_joined_by_hand(tmp_path: Path) -> None:
     """A Livox sensor whose driver publishes at 50 Hz, read as scans of 0.1 s; the 8th message is lost."""
     seen = firings()
-    ahead = seen.points[:, 0] > np.abs(seen.points[:, 1])
 
     def livox(of: Firings, begin: int, end: int, kept: np.ndarray, ros2: bool) -> bags.Message:
         cloud = bags.fill(bags.LIVOX_OFFSET_CLOUD, of.seen(kept), of.since_ns[kept] - begin)
@@ -268,7 +267,6 @@ def test_any_number_is_joined_by_hand(tmp_path: Path) -> None:
     for number, scan in enumerate(scans):
         assert scan.stamp_ns == bags.START_NS + number * bags.PERIOD_NS
     assert scans[3].time.max() == pytest.approx(0.1, abs=5e-4)
-    assert ahead.any()
 
 
 def test_a_number_that_is_no_turn_is_joined_by_hand(tmp_path: Path) -> None:
@@ -304,16 +302,11 @@ def strips() -> list[bags.Message]:
     """A view of 120 deg in five strips from left to right, again and again."""
     seen = firings(turns=40, period_ns=3 * bags.PERIOD_NS)
     length = 24 * 3 * bags.PERIOD_NS // 360
-    strips = [piece for number, piece in enumerate(parts(seen, length)) if number % 15 < 5]
-    moved = [
-        (number * length, kept - (begin - number * length) * 360 // (3 * bags.PERIOD_NS) * 0, begin)
-        for number, (begin, kept) in enumerate(strips)
-    ]
+    cut = [piece for number, piece in enumerate(parts(seen, length)) if number % 15 < 5]
     messages = []
-    for at, kept, begin in moved:
-        times = (bags.START_NS + seen.since_ns[kept] - begin + at) * 1e-9
-        cloud = bags.fill(bags.HESAI, seen.seen(kept), times)
-        stamp = bags.START_NS + at
+    for number, (begin, kept) in enumerate(cut):
+        stamp = bags.START_NS + number * length
+        cloud = bags.fill(bags.HESAI, seen.seen(kept), (stamp + seen.since_ns[kept] - begin) * 1e-9)
         messages.append(("/points", stamp + length, bags.cloud_message(stamp, cloud)))
     return messages
 
@@ -348,7 +341,9 @@ def front_and_back() -> list[bags.Message]:
     ],
     ids=["full", "quarter blocked", "mostly blocked", "solid 10 Hz", "solid 50 Hz", "strips", "two sensors"],
 )
-def test_what_is_no_part_of_a_turn_is_not_joined(tmp_path: Path, messages) -> None:  # noqa: ANN001
+def test_what_is_no_part_of_a_turn_is_not_joined(
+    tmp_path: Path, messages: Callable[[], list[bags.Message]]
+) -> None:
     made = messages()
     sequence = opened(tmp_path / "a.db3", made)
     assert not is_joined(sequence)
@@ -378,7 +373,8 @@ def test_a_part_of_the_recording_counts_its_own_sweeps(tmp_path: Path) -> None:
     messages = recorded(seen, parts(seen, FIFTH_NS), FIFTH_NS, part_recordings.hesai)
     sequence = opened(tmp_path / "a.db3", messages)
     whole = list(sequence.scans())
-    part = sequence.within(bags.START_NS + 4 * bags.PERIOD_NS + FIFTH_NS, bags.START_NS + 9 * bags.PERIOD_NS)
+    begin_ns = bags.START_NS + 4 * bags.PERIOD_NS
+    part = sequence.within(begin_ns + FIFTH_NS, begin_ns + 5 * bags.PERIOD_NS + FIFTH_NS)
     assert part.info.scan_count == 12
-    check_same(list(part.scans()), whole[4:9][:-1] if len(list(part.scans())) == 4 else whole[4:9])
+    check_same(list(part.scans()), whole[4:9])
     check_same(list(part.scans(1, 2)), whole[5:7])
