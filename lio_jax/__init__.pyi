@@ -13,6 +13,7 @@ from .data import LidarScan as LidarScan
 from .data import Sequence as Sequence
 from .data import Trajectory as Trajectory
 from .data import open_sequence as open_sequence
+from .data.scan_joiner import ScanJoiner as ScanJoiner
 from .data.trajectory import read_tum as read_tum
 from .estimation.chain import Chain as Chain
 from .estimation.factors import PoseMeasurement as PoseMeasurement

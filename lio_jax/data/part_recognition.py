@@ -50,17 +50,17 @@ def recognise_messages(
     wanted = config.messages_per_scan
     if not firsts:
         return None
-    if wanted >= 2 or (wanted == 0 and _may_be_parts([cloud for cloud, _ in firsts])):
-        taken = list(_of_a_second(chain(firsts, source)))
-        each = recognise_times(firsts, config)
-        joining = _joining([cloud for cloud, _ in taken], each, config)
-        if joining is not None:
-            return _joined_reading([cloud for cloud, _ in taken], each, joining, config, where), joining
+    if wanted >= 2 or (wanted == 0 and narrow([cloud for cloud, _ in firsts])):
+        taken = [cloud for cloud, _ in _of_a_second(chain(firsts, source))]
+        found = recognise_joining(taken, recognise_times(firsts, config), config, where)
+        if found is not None:
+            return found
     reading = recognise_clouds(firsts, config, where, known_whole=wanted == 1)
     return None if reading is None else (reading, None)
 
 
-def _may_be_parts(clouds: Sequence[RawCloud]) -> bool:
+def narrow(clouds: Sequence[RawCloud]) -> bool:
+    """Return whether messages are narrow enough to be parts of a sweep, and not those of a Livox driver."""
     arcs = [arc_of(cloud.points) for cloud in clouds if cloud.ring_source != _LIVOX_RING]
     return may_be_parts([arc for arc in arcs if arc is not None])
 
@@ -75,6 +75,26 @@ def _of_a_second(clouds: Iterator[tuple[RawCloud, int]]) -> Iterator[tuple[RawCl
         if count >= SCANS_LOOKED_AT and late:
             return
         yield cloud, received_ns
+
+
+def recognise_joining(
+    clouds: Sequence[RawCloud], each: ScanReading, config: DataConfig, where: str
+) -> tuple[ScanReading, Joining] | None:
+    """Settle how messages are joined; None if each is a scan.
+
+    Args:
+        clouds: messages of about a second in recorded order, at least one.
+        each: how a message's times are read.
+        config: settings that override what is recognised.
+        where: what is read, in errors.
+
+    Raises:
+        UsageError: the settings name a number of beams that the points do not fit.
+    """
+    joining = _joining(clouds, each, config)
+    if joining is None:
+        return None
+    return _joined_reading(clouds, each, joining, config, where), joining
 
 
 def _joining(clouds: Sequence[RawCloud], each: ScanReading, config: DataConfig) -> Joining | None:

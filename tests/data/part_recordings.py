@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lio_jax.data.sequence import LidarScan
 from tests.data import bags
 
 RINGS = 16
@@ -58,7 +59,7 @@ def firings(
 def parts(
     all_of_them: Firings, length_ns: int, kept: np.ndarray | None = None
 ) -> list[tuple[int, np.ndarray]]:
-    """Cut firings into messages of one length: the begin of each (ns from the first firing) and its firings."""
+    """Cut firings into messages of one length; return the begin of each (ns) and its firings."""
     place = all_of_them.since_ns // length_ns
     cut = []
     for number in range(int(place.max()) + 1):
@@ -111,3 +112,21 @@ def recorded(
 def _message(cloud: np.ndarray, stamp_ns: int, end_ns: int, ros2: bool) -> bags.Message:
     stamp = bags.START_NS + stamp_ns
     return "/points", bags.START_NS + end_ns + LATENCY_NS, bags.cloud_message(stamp, cloud, ros2)
+
+
+def scans_of(seen: Firings, cut: Iterable[tuple[int, np.ndarray]], length_ns: int) -> list[LidarScan]:
+    """Return pieces as a program has them that pushes what its driver calls a scan."""
+    pushed = []
+    for begin, kept in cut:
+        part = seen.seen(kept, begin)
+        pushed.append(
+            LidarScan(
+                bags.START_NS + begin,
+                part.points,
+                part.time.astype(np.float32),
+                part.ring.astype(np.int32),
+                part.intensity,
+                length_ns * 1e-9,
+            )
+        )
+    return pushed
