@@ -104,9 +104,11 @@ def test_messages_are_scans_where_the_settings_say_so(cli: Cli, tmp_path: Path, 
 
 def test_tune_reads_whole_sweeps(cli: Cli, tmp_path: Path, whole: Path, in_parts: Path) -> None:
     values = {}
+    write_tum(tmp_path / "truth.tum", truth())
+    scored = ("--objective", "rpe", "--gt", tmp_path / "truth.tum", "--scans", 6)
     for name, bag in (("whole", whole), ("parts", in_parts)):
-        words = ("--params", "lidar.range_sigma", "--iterations", 1, "--out", tmp_path / name)
-        done = cli("tune", bag, *words, "--scans", 6, "--set", *extrinsics())
+        words = ("--params", "registration.kernel", "--iterations", 1, "--out", tmp_path / name)
+        done = cli("tune", bag, *words, *scored, "--set", *extrinsics())
         assert done.status == 0, done.err
         values[name] = (tmp_path / name / "tuned.yaml").read_text()
     assert values["parts"] == values["whole"].replace(str(whole), str(in_parts))
