@@ -13,7 +13,6 @@ from .data import LidarScan as LidarScan
 from .data import Sequence as Sequence
 from .data import Trajectory as Trajectory
 from .data import open_sequence as open_sequence
-from .data.scan_joiner import ScanJoiner as ScanJoiner
 from .data.trajectory import read_tum as read_tum
 from .estimation.chain import Chain as Chain
 from .estimation.factors import PoseMeasurement as PoseMeasurement
@@ -60,6 +59,7 @@ from .registration.voxel_planes import point_noise as point_noise
 from .run.known_map import KnownMap as KnownMap
 from .run.localise import localise as localise
 from .run.pushed import PushedOdometry as PushedOdometry
+from .run.pushed import ScanJoiner as ScanJoiner
 from .run.run import imu_feed as imu_feed
 from .run.run import run_sequence as run_sequence
 from .run.run import settings_for as settings_for

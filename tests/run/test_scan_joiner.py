@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from lio_jax.data.rosbag import RosbagSequence
-from lio_jax.data.scan_joiner import ScanJoiner
 from lio_jax.data.sequence import LidarScan
+from lio_jax.run.pushed import ScanJoiner
 from tests.data import bags, part_recordings
 from tests.data.bag_recordings import AUTO
 from tests.data.part_recordings import firings, parts, recorded, scans_of
