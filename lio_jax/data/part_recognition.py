@@ -154,14 +154,14 @@ def _note(joining: Joining, config: DataConfig) -> str:
     turning = joining.turning
     if turning is None:
         return (
-            f"{round(joining.messages)} messages are joined to a scan of {joining.period:.4g} s "
+            f"{round(joining.messages)} messages are joined to a scan of {joining.period:.3g} s "
             "(config.data.messages_per_scan)"
         )
     number = f"{joining.messages:.4g}"
     start = f"{np.degrees(turning.start) % 360:.0f}"
     sentence = (
         f"each message holds a part of a turn: {number} messages are joined to a scan of "
-        f"{joining.period:.4g} s, which starts at {start} deg of azimuth"
+        f"{joining.period:.3g} s, which starts at {start} deg of azimuth"
     )
     if config.messages_per_scan:
         return f"{sentence} (config.data.messages_per_scan)"

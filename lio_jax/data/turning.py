@@ -171,10 +171,7 @@ def recognised_turning(seen: Sequence[SeenMessage]) -> Turning | None:
     step = float(np.mean(steps[(steps > 0.5 * step) & (steps < 1.5 * step)]))
     messages = 1.0 / (abs(rate) * step)
     start, aligned = _start(seen, rate, messages)
-    if aligned:
-        messages = float(round(messages))
-        rate = float(np.sign(rate)) / (messages * step)
-    return Turning(rate, messages, start)
+    return Turning(rate, float(round(messages)) if aligned else messages, start % _TURN)
 
 
 def _constant_rate(

@@ -9,9 +9,11 @@ import pytest
 from lio_jax.data.config import DataConfig
 from lio_jax.data.rosbag import RosbagSequence
 from lio_jax.data.sequence import LidarScan
+from lio_jax.sim.sequence import SimulatedSequence
 from tests.data import bags, part_recordings
 from tests.data.bag_recordings import AUTO
 from tests.data.part_recordings import Driver, Firings, firings, parts, recorded
+from tests.shared_data import SHARED_DATA, needs_shared
 
 FIFTH_NS = bags.PERIOD_NS // 5
 
@@ -278,6 +280,67 @@ def test_a_number_that_is_no_turn_is_joined_by_hand(tmp_path: Path) -> None:
     assert {len(scan.points) for scan in scans} == {3 * 72 * part_recordings.RINGS}
 
 
+def simulated(sensor: str, number: float, jitter: float = 0.0) -> list[bags.Message]:
+    """Return 0.8 s of a simulated sensor in a room, in the layout of a Velodyne, in so many messages a turn.
+
+    Args:
+        sensor: name of the sensor.
+        number: messages in 0.1 s.
+        jitter: standard deviation of the stamps' errors as a share of a message.
+    """
+    scans = list(SimulatedSequence("room", sensor, duration_s=0.8, seed=2).scans())
+    since = [s.stamp_ns - scans[0].stamp_ns + np.round(s.time.astype(np.float64) * 1e9) for s in scans]
+    since_ns = np.concatenate(since).astype(np.int64)
+    order = np.argsort(since_ns, kind="stable")
+    fields = ("points", "ring", "intensity")
+    seen = Firings(since_ns[order], *(np.concatenate([getattr(s, f) for s in scans])[order] for f in fields))
+    length = round(bags.PERIOD_NS / number)
+    errors = np.random.default_rng(0).normal(0.0, jitter * length, 4000).round().astype(int)
+    return [
+        part_recordings.velodyne(seen, max(0, begin + int(error)), begin + length, kept, True)
+        for (begin, kept), error in zip(parts(seen, length), errors, strict=False)
+    ]
+
+
+@pytest.mark.parametrize("number", [2, 16, 75.35])
+def test_beams_that_differ_in_azimuth(tmp_path: Path, number: float) -> None:
+    """An OS1-64: the four azimuths of a column differ by up to 6.3 deg, more than a packet turns."""
+    sequence = opened(tmp_path / "a.db3", simulated("os1_64", number))
+    assert f": {number:.4g}"[:-1] in joined_note(sequence)
+    assert sequence.info.scan_count == 8
+
+
+@pytest.mark.parametrize(("number", "jitter"), [(5, 0.1), (75.35, 0.3)])
+def test_stamps_that_are_not_even(tmp_path: Path, number: float, jitter: float) -> None:
+    sequence = opened(tmp_path / "a.db3", simulated("os1_64", number, jitter))
+    assert is_joined(sequence)
+    scans = list(sequence.scans())
+    assert len(scans) == 8
+    assert {round(scan.duration, 2) for scan in scans} == {0.1}
+
+
+@needs_shared
+def test_the_real_ouster_recording_in_parts(tmp_path: Path) -> None:
+    """Three real sweeps cut into the 16 packets of an OS1: 64 columns each."""
+    whole, cut = [], []
+    for scan in RosbagSequence(SHARED_DATA / "ouster" / "os1_128_3scans.bag", AUTO).scans():
+        since = np.round(scan.time.astype(np.float64) * 1e9).astype(np.int64)
+        order = np.argsort(since, kind="stable")
+        length = bags.PERIOD_NS // 16
+        for messages, number, each in ((whole, 1, bags.PERIOD_NS), (cut, 16, length)):
+            for part in range(number):
+                kept = order[np.minimum(since[order] // each, number - 1) == part]
+                seen = bags.Sweep(scan.points[kept], scan.time[kept], scan.ring[kept], scan.intensity[kept])
+                stamp = scan.stamp_ns + part * each
+                cloud = bags.fill(bags.OUSTER, seen, since[kept] - part * each)
+                messages.append(("/points", stamp + each + 1_000_000, bags.cloud_message(stamp, cloud)))
+    expected = opened(tmp_path / "whole.db3", whole)
+    assert not is_joined(expected)
+    sequence = opened(tmp_path / "a.db3", cut)
+    assert ": 16 messages are joined to a scan of 0.1 s" in joined_note(sequence)
+    check_same(list(sequence.scans()), list(expected.scans()))
+
+
 def full_sweeps() -> list[bags.Message]:
     seen = firings()
     return recorded(seen, parts(seen, bags.PERIOD_NS), bags.PERIOD_NS, part_recordings.velodyne)
@@ -338,8 +401,13 @@ def front_and_back() -> list[bags.Message]:
         lambda: solid_state(bags.PERIOD_NS // 5),
         strips,
         front_and_back,
+        lambda: simulated("livox", 1),
+        lambda: simulated("livox", 5),
     ],
-    ids=["full", "quarter blocked", "mostly blocked", "solid 10 Hz", "solid 50 Hz", "strips", "two sensors"],
+    ids=[
+        *("full", "quarter blocked", "mostly blocked", "solid 10 Hz", "solid 50 Hz", "strips", "two sensors"),
+        *("rosette 10 Hz", "rosette 50 Hz"),
+    ],
 )
 def test_what_is_no_part_of_a_turn_is_not_joined(
     tmp_path: Path, messages: Callable[[], list[bags.Message]]
