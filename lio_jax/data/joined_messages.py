@@ -46,13 +46,23 @@ class Joining:
 
     def start_ns(self, cloud: RawCloud) -> int:
         """Return when a message's first firing was, ns."""
-        timing = self.timing
-        if timing is None or cloud.time_range is None:
+        timing, limits = self.timing, self.limits(cloud)
+        if timing is None or limits is None:
             return cloud.stamp_ns
-        low, high = cloud.time_range
+        low, high = limits
         if timing.absolute:
             return ticks_to_ns(low, timing.tick_ns) if timing.anchor == "points" else cloud.stamp_ns
         return cloud.stamp_ns + round((low + _header_tick(timing, low, high)) * timing.tick_ns)
+
+    def limits(self, cloud: RawCloud) -> tuple[float, float] | None:
+        """Return the smallest and the largest possible tick of a message; None where there is none."""
+        if self.timing is None or cloud.time is None or cloud.time_range is None:
+            return None
+        if self.timing.can_be_scan(*cloud.time_range):
+            return cloud.time_range
+        wrong = self.timing.outliers(cloud.time)
+        possible = cloud.time if wrong is None else cloud.time[~wrong]
+        return (possible.min().item(), possible.max().item()) if possible.size else None
 
     def whole_timing(self) -> PointTiming | None:
         """Return the meaning of the times of joined clouds; None where they are motion compensated."""
@@ -102,17 +112,18 @@ class Joining:
             return time, (float(time.min()), float(time.max())) if time.size else None
         if part.time is None or timing.absolute:
             return part.time, part.time_range
+        limits = self.limits(part)
+        header = 0.0 if limits is None else _header_tick(timing, *limits)
+
+        def since(ticks: NDArray[np.float64]) -> NDArray[np.float64]:
+            # float64 states times from a stamp to far less than a ns; the reading drops impossible ones
+            return (np.clip(ticks, -_FARTHEST, _FARTHEST) + header) * timing.tick_ns + later
+
+        times = since(part.time.astype(np.float64))
         if part.time_range is None:
-            return np.zeros(0), None
-        low, high = part.time_range
-        header = _header_tick(timing, low, high)
-
-        def since(ticks: float) -> float:
-            return (ticks + header) * timing.tick_ns + later
-
-        # float64 states times from a stamp to far less than a ns
-        times = (part.time.astype(np.float64) + header) * timing.tick_ns + later
-        return times, (since(low), since(high))
+            return times, None
+        low, high = since(np.array(part.time_range, np.float64)).tolist()
+        return times, (low, high)
 
     def _reconstructed(self, part: RawCloud) -> NDArray[np.float64]:
         """Return the time of each point from the message's header stamp, (n,) s."""
@@ -125,6 +136,10 @@ class Joining:
             count = len(part.points)
             seconds, length = self.step * np.arange(count) / max(count, 1), self.step
         return seconds - length if self.stamp_at == "end" else seconds
+
+
+_FARTHEST = 1e18
+"""Ticks beyond this are impossible in any unit, and are read as this limit."""
 
 
 def _header_tick(timing: PointTiming, low: float, high: float) -> float:

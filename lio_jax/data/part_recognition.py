@@ -18,6 +18,7 @@ from lio_jax.data.scan_reading import (
     recognise_rings,
     recognise_times,
 )
+from lio_jax.data.time_order import ascending
 from lio_jax.data.turning import SeenMessage, arc_of, may_be_parts, recognised_turning, seen_message
 
 LOOKED_AT_NS = 1_000_000_000
@@ -103,35 +104,39 @@ def _joining(clouds: Sequence[RawCloud], each: ScanReading, config: DataConfig) 
     wanted = config.messages_per_scan
     unknown = Joining(None, max(wanted, 1), each.sweep, each.timing, each.stamp_at, compensated)
     starts = [unknown.start_ns(cloud) for cloud in clouds]
-    # duplicates and messages out of order say nothing on the usual step
-    steps = [later - earlier for earlier, later in pairwise(starts) if later > earlier]
+    # duplicates, messages out of order and wrong stamps say nothing
+    kept = ascending(starts)
+    kept = [place for place in kept if starts[place] <= starts[kept[0]] + 2 * LOOKED_AT_NS]
+    steps = [starts[later] - starts[earlier] for earlier, later in pairwise(kept)]
     step = float(np.median(steps)) * 1e-9 if steps else config.scan_period
-    turning = None if compensated else recognised_turning(_seen(clouds, starts, each, step))
+    turning = None if compensated else recognised_turning(_seen(clouds, starts, kept, unknown, step))
     if turning is not None and wanted in (0, round(turning.messages)):
         return replace(unknown, turning=turning, messages=turning.messages, step=step)
     return replace(unknown, messages=wanted, step=step) if wanted else None
 
 
 def _seen(
-    clouds: Sequence[RawCloud], starts: Sequence[int], each: ScanReading, step: float
+    clouds: Sequence[RawCloud], starts: Sequence[int], kept: Sequence[int], each: Joining, step: float
 ) -> list[SeenMessage]:
+    """Return what the kept messages with points show."""
     seen: list[SeenMessage] = []
-    earlier_ns, earlier_low = -1, 0.0
-    for cloud, start_ns in zip(clouds, starts, strict=True):
-        if start_ns <= earlier_ns or not len(cloud.points):
-            continue
+    earlier_low = 0.0
+    for cloud, start_ns in ((clouds[place], starts[place]) for place in kept):
         seconds: NDArray[np.float64] | None = None
         low = 0.0
-        if each.timing is not None and cloud.time is not None and cloud.time_range is not None:
+        limits = each.limits(cloud)
+        # times of which some are impossible say nothing
+        all_possible = limits is not None and limits == cloud.time_range
+        if each.timing is not None and cloud.time is not None and limits is not None and all_possible:
             tick = each.timing.tick_ns * 1e-9
-            seconds = (cloud.time - cloud.time.dtype.type(cloud.time_range[0])).astype(np.float64) * tick
-            low = cloud.time_range[0] * tick
+            seconds = (cloud.time - cloud.time.dtype.type(limits[0])).astype(np.float64) * tick
+            low = limits[0] * tick
         # times that run on over a sweep fall back by most of it, those of one message by less than a message
         restarts = len(seen) > 0 and low < earlier_low - 1.5 * step
         one = seen_message(start_ns, cloud.points, seconds, restarts)
         if one is not None:
             seen.append(one)
-            earlier_ns, earlier_low = start_ns, low
+            earlier_low = low
     return seen
 
 

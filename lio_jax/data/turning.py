@@ -168,8 +168,8 @@ def recognised_turning(seen: Sequence[SeenMessage]) -> Turning | None:
         return None
     # firings are sparse in small messages: one step says less than their mean
     steps = np.diff(seconds)
-    step = float(np.mean(steps[(steps > 0.5 * step) & (steps < 1.5 * step)]))
-    messages = 1.0 / (abs(rate) * step)
+    usual = steps[(steps > 0.5 * step) & (steps < 1.5 * step)]
+    messages = 1.0 / (abs(rate) * (float(np.mean(usual)) if usual.size else step))
     start, aligned = _start(seen, rate, messages)
     return Turning(rate, float(round(messages)) if aligned else messages, start % _TURN)
 

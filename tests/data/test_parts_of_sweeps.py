@@ -243,6 +243,29 @@ def test_a_damaged_message_is_a_lost_one(tmp_path: Path) -> None:
     assert "a: message 26 cannot be read and was skipped" in sequence.warnings_so_far[0]
 
 
+def test_wrong_stamps_and_times_of_a_few_messages(tmp_path: Path) -> None:
+    """Message 3 is stamped a day ahead, and a point of message 21 in the year 1970."""
+    seen = firings()
+    cut = parts(seen, FIFTH_NS)
+    whole = list(opened(tmp_path / "w.db3", recorded(seen, cut, FIFTH_NS, part_recordings.ouster)).scans())
+    messages = recorded(seen, cut, FIFTH_NS, part_recordings.ouster)
+    day_ns = 24 * 3600 * 1_000_000_000
+    header = bags.header(bags.START_NS + 3 * FIFTH_NS + day_ns, ros2=True)
+    messages[3] = (*messages[3][:2], replace(messages[3][2], header=header))
+    broken = bags.fill(bags.OUSTER, seen.seen(cut[21][1]), seen.since_ns[cut[21][1]] - cut[21][0])
+    broken["t"][5] = 4_000_000_000
+    messages[21] = (*messages[21][:2], bags.cloud_message(bags.START_NS + cut[21][0], broken))
+    sequence = opened(tmp_path / "a.db3", messages)
+    scans = list(sequence.scans())
+    assert sequence.info.scan_count == len(scans) == 12
+    check_same(scans[1:4] + scans[5:], whole[1:4] + whole[5:])
+    assert len(scans[0].points) == 4 * 72 * part_recordings.RINGS
+    assert len(scans[4].points) == 5 * 72 * part_recordings.RINGS - 1
+    assert scans[4].duration == whole[4].duration
+    assert any("a: message 3" in warning and "wrong stamp" in warning for warning in sequence.warnings_so_far)
+    assert any("1 points with impossible times" in warning for warning in sequence.warnings_so_far)
+
+
 def test_a_recording_that_begins_inside_a_sweep(tmp_path: Path) -> None:
     """Messages begin at the same azimuths in each turn; one of them is straight ahead, where drivers cut."""
     seen = firings()
