@@ -1,16 +1,22 @@
 """A sensor that turns without a pause, and its messages as drivers cut them: parts of a turn or turns."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from lio_jax.data.config import DataConfig
+from lio_jax.data.rosbag import RosbagSequence
 from lio_jax.data.sequence import LidarScan
+from lio_jax.sim.sequence import SimulatedSequence
 from tests.data import bags
+from tests.data.bag_recordings import AUTO
 
 RINGS = 16
 XYZI = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 LATENCY_NS = 2_000_000
+FIFTH_NS = bags.PERIOD_NS // 5
 
 
 @dataclass(frozen=True)
@@ -130,3 +136,38 @@ def scans_of(seen: Firings, cut: Iterable[tuple[int, np.ndarray]], length_ns: in
             )
         )
     return pushed
+
+
+def simulated(sensor: str, number: float, jitter: float = 0.0) -> list[bags.Message]:
+    """Return 0.8 s of a simulated sensor in a room, in the layout of a Velodyne, in so many messages a turn.
+
+    Args:
+        sensor: name of the sensor.
+        number: messages in 0.1 s.
+        jitter: standard deviation of the stamps' errors as a share of a message.
+    """
+    scans = list(SimulatedSequence("room", sensor, duration_s=0.8, seed=2).scans())
+    since = [s.stamp_ns - scans[0].stamp_ns + np.round(s.time.astype(np.float64) * 1e9) for s in scans]
+    since_ns = np.concatenate(since).astype(np.int64)
+    order = np.argsort(since_ns, kind="stable")
+    fields = ("points", "ring", "intensity")
+    seen = Firings(since_ns[order], *(np.concatenate([getattr(s, f) for s in scans])[order] for f in fields))
+    length = round(bags.PERIOD_NS / number)
+    errors = np.random.default_rng(0).normal(0.0, jitter * length, 4000).round().astype(int)
+    return [
+        velodyne(seen, max(0, begin + int(error)), begin + length, kept, True)
+        for (begin, kept), error in zip(parts(seen, length), errors, strict=False)
+    ]
+
+
+def opened(path: Path, messages: Sequence[bags.Message], config: DataConfig = AUTO) -> RosbagSequence:
+    return RosbagSequence(bags.write_bag(path, messages), config)
+
+
+def joined_note(sequence: RosbagSequence) -> str:
+    (note,) = [note for note in sequence.info.notes if "joined" in note]
+    return note
+
+
+def is_joined(sequence: RosbagSequence) -> bool:
+    return any("joined" in note for note in sequence.info.notes)

@@ -1,7 +1,7 @@
 """Messages that hold parts of a turn become the scans of whole turns; nothing else is joined."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,26 +11,21 @@ import pytest
 from lio_jax.data.config import DataConfig
 from lio_jax.data.rosbag import RosbagSequence
 from lio_jax.data.sequence import LidarScan
-from lio_jax.sim.sequence import SimulatedSequence
 from tests.data import bags, part_recordings
 from tests.data.bag_recordings import AUTO
-from tests.data.part_recordings import Driver, Firings, firings, parts, recorded
+from tests.data.part_recordings import (
+    FIFTH_NS,
+    Driver,
+    Firings,
+    firings,
+    is_joined,
+    joined_note,
+    opened,
+    parts,
+    recorded,
+    simulated,
+)
 from tests.shared_data import SHARED_DATA, needs_shared
-
-FIFTH_NS = bags.PERIOD_NS // 5
-
-
-def opened(path: Path, messages: Sequence[bags.Message], config: DataConfig = AUTO) -> RosbagSequence:
-    return RosbagSequence(bags.write_bag(path, messages), config)
-
-
-def joined_note(sequence: RosbagSequence) -> str:
-    (note,) = [note for note in sequence.info.notes if "joined" in note]
-    return note
-
-
-def is_joined(sequence: RosbagSequence) -> bool:
-    return any("joined" in note for note in sequence.info.notes)
 
 
 def check_same(scans: Sequence[LidarScan], expected: Sequence[LidarScan], time_ulps: int = 0) -> None:
@@ -341,28 +336,6 @@ def test_a_number_that_is_no_turn_is_joined_by_hand(tmp_path: Path) -> None:
     assert {len(scan.points) for scan in scans} == {3 * 72 * part_recordings.RINGS}
 
 
-def simulated(sensor: str, number: float, jitter: float = 0.0) -> list[bags.Message]:
-    """Return 0.8 s of a simulated sensor in a room, in the layout of a Velodyne, in so many messages a turn.
-
-    Args:
-        sensor: name of the sensor.
-        number: messages in 0.1 s.
-        jitter: standard deviation of the stamps' errors as a share of a message.
-    """
-    scans = list(SimulatedSequence("room", sensor, duration_s=0.8, seed=2).scans())
-    since = [s.stamp_ns - scans[0].stamp_ns + np.round(s.time.astype(np.float64) * 1e9) for s in scans]
-    since_ns = np.concatenate(since).astype(np.int64)
-    order = np.argsort(since_ns, kind="stable")
-    fields = ("points", "ring", "intensity")
-    seen = Firings(since_ns[order], *(np.concatenate([getattr(s, f) for s in scans])[order] for f in fields))
-    length = round(bags.PERIOD_NS / number)
-    errors = np.random.default_rng(0).normal(0.0, jitter * length, 4000).round().astype(int)
-    return [
-        part_recordings.velodyne(seen, max(0, begin + int(error)), begin + length, kept, True)
-        for (begin, kept), error in zip(parts(seen, length), errors, strict=False)
-    ]
-
-
 @pytest.mark.parametrize("number", [2, 16, 75.35])
 def test_beams_that_differ_in_azimuth(tmp_path: Path, number: float) -> None:
     """An OS1-64: the four azimuths of a column differ by up to 6.3 deg, more than a packet turns."""
@@ -402,84 +375,6 @@ def test_the_real_ouster_recording_in_parts(tmp_path: Path) -> None:
     sequence = opened(tmp_path / "a.db3", cut)
     assert ": 16 messages are joined to a scan of 0.1 s" in joined_note(sequence)
     check_same(list(sequence.scans()), list(expected.scans()))
-
-
-def full_sweeps() -> list[bags.Message]:
-    seen = firings()
-    return recorded(seen, parts(seen, bags.PERIOD_NS), bags.PERIOD_NS, part_recordings.velodyne)
-
-
-def blocked(share: float) -> list[bags.Message]:
-    """Whole sweeps of a sensor of which a vehicle covers a share."""
-    seen = firings()
-    azimuth = np.arctan2(seen.points[:, 1], seen.points[:, 0]) / (2 * np.pi) % 1.0
-    cut = parts(seen, bags.PERIOD_NS, azimuth > share)
-    return recorded(seen, cut, bags.PERIOD_NS, part_recordings.velodyne)
-
-
-def solid_state(period_ns: int) -> list[bags.Message]:
-    """A sensor with 120 deg of view that looks to and fro, as it is published at 10 or 50 Hz."""
-    seen = firings(turns=12 * bags.PERIOD_NS / period_ns, period_ns=period_ns)
-    cut = parts(seen, period_ns, seen.points[:, 0] > 0.5 * np.linalg.norm(seen.points[:, :2], axis=1))
-    return recorded(seen, cut, period_ns, part_recordings.hesai)
-
-
-def strips() -> list[bags.Message]:
-    """A view of 120 deg in five strips from left to right, again and again."""
-    seen = firings(turns=40, period_ns=3 * bags.PERIOD_NS)
-    length = 24 * 3 * bags.PERIOD_NS // 360
-    cut = [piece for number, piece in enumerate(parts(seen, length)) if number % 15 < 5]
-    messages = []
-    for number, (begin, kept) in enumerate(cut):
-        stamp = bags.START_NS + number * length
-        cloud = bags.fill(bags.HESAI, seen.seen(kept), (stamp + seen.since_ns[kept] - begin) * 1e-9)
-        messages.append(("/points", stamp + length, bags.cloud_message(stamp, cloud)))
-    return messages
-
-
-def front_and_back() -> list[bags.Message]:
-    """Two solid-state sensors of 140 deg, ahead and behind, whose messages take turns on one topic."""
-    seen = firings(turns=40)
-    ahead = seen.points[:, 0] > np.cos(np.radians(70)) * np.linalg.norm(seen.points[:, :2], axis=1)
-    behind = seen.points[:, 0] < -np.cos(np.radians(70)) * np.linalg.norm(seen.points[:, :2], axis=1)
-    messages = []
-    for number in range(40):
-        kept = np.flatnonzero((seen.since_ns // bags.PERIOD_NS == number) & (behind if number % 2 else ahead))
-        # each scans its view in 50 ms
-        kept = kept[np.argsort(seen.points[kept, 2], kind="stable")]
-        times = bags.START_NS * 1e-9 + 0.05 * number + np.linspace(0.0, 0.05, len(kept))
-        cloud = bags.fill(bags.HESAI, seen.seen(kept), times)
-        stamp = bags.START_NS + number * 50_000_000
-        messages.append(("/points", stamp + 52_000_000, bags.cloud_message(stamp, cloud)))
-    return messages
-
-
-@pytest.mark.parametrize(
-    "messages",
-    [
-        full_sweeps,
-        lambda: blocked(0.25),
-        lambda: blocked(0.7),
-        lambda: solid_state(bags.PERIOD_NS),
-        lambda: solid_state(bags.PERIOD_NS // 5),
-        strips,
-        front_and_back,
-        lambda: simulated("livox", 1),
-        lambda: simulated("livox", 5),
-    ],
-    ids=[
-        *("full", "quarter blocked", "mostly blocked", "solid 10 Hz", "solid 50 Hz", "strips", "two sensors"),
-        *("rosette 10 Hz", "rosette 50 Hz"),
-    ],
-)
-def test_what_is_no_part_of_a_turn_is_not_joined(
-    tmp_path: Path, messages: Callable[[], list[bags.Message]]
-) -> None:
-    made = messages()
-    sequence = opened(tmp_path / "a.db3", made)
-    assert not is_joined(sequence)
-    assert sequence.info.scan_count == len(made)
-    assert len(list(sequence.scans())) == len(made)
 
 
 def test_a_blocked_quarter_does_not_shift_the_sweeps(tmp_path: Path) -> None:
