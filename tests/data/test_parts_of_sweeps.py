@@ -206,7 +206,7 @@ def test_a_gap_of_many_turns_joins_nothing(tmp_path: Path) -> None:
     """A recorder that lost 3.46 s: the message behind the gap lies in the sector after that before it."""
     seen = firings(turns=45)
     cut = parts(seen, FIFTH_NS)
-    left = cut[:27] + cut[200:]
+    left = cut[:27] + cut[202:]
     sequence = opened(tmp_path / "a.db3", recorded(seen, left, FIFTH_NS, part_recordings.ouster))
     scans = list(sequence.scans())
     assert max(scan.duration for scan in scans) < 0.1
@@ -329,11 +329,23 @@ def test_any_number_is_joined_by_hand(tmp_path: Path) -> None:
 
 def test_a_number_that_is_no_turn_is_joined_by_hand(tmp_path: Path) -> None:
     seen = firings()
-    messages = recorded(seen, parts(seen, FIFTH_NS), FIFTH_NS, part_recordings.hesai)
+    cut = parts(seen, FIFTH_NS)
+    messages = recorded(seen, cut, FIFTH_NS, part_recordings.ouster)
     sequence = opened(tmp_path / "a.db3", messages, DataConfig(messages_per_scan=3))
-    scans = list(sequence.scans())
-    assert len(scans) == sequence.info.scan_count == 20
-    assert {len(scan.points) for scan in scans} == {3 * 72 * part_recordings.RINGS}
+    whole = list(sequence.scans())
+    assert len(whole) == sequence.info.scan_count == 20
+    assert {len(scan.points) for scan in whole} == {3 * 72 * part_recordings.RINGS}
+    # messages 7, 30 and 31 are lost, 40 and 52 are stamped late
+    for number in (40, 52):
+        late = bags.header(bags.START_NS + number * FIFTH_NS + FIFTH_NS // 2 - 1_000_000, ros2=True)
+        messages[number] = (*messages[number][:2], replace(messages[number][2], header=late))
+    left = [message for number, message in enumerate(messages) if number not in (7, 30, 31)]
+    lossy = opened(tmp_path / "b.db3", left, DataConfig(messages_per_scan=3))
+    scans = list(lossy.scans())
+    counts = [len(scan.points) // (72 * part_recordings.RINGS) for scan in scans]
+    assert counts == [3, 3, 2, *[3] * 7, 1, *[3] * 9]
+    intact = [number for number in range(20) if number not in (2, 10, 13, 17)]
+    check_same([scans[number] for number in intact], [whole[number] for number in intact])
 
 
 @pytest.mark.parametrize("number", [2, 16, 75.35])
