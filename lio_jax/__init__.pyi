@@ -59,6 +59,7 @@ from .registration.voxel_planes import point_noise as point_noise
 from .run.known_map import KnownMap as KnownMap
 from .run.localise import localise as localise
 from .run.pushed import PushedOdometry as PushedOdometry
+from .run.pushed import ScanJoiner as ScanJoiner
 from .run.run import imu_feed as imu_feed
 from .run.run import run_sequence as run_sequence
 from .run.run import settings_for as settings_for

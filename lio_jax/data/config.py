@@ -33,6 +33,9 @@ class DataConfig:
     """Whether the recording's points are already motion compensated (KITTI odometry: yes)."""
     vertical_correction_deg: float = static(0.205, "deg")
     """Correction of the HDL-64E's elevation angles, which is applied to the scans of KITTI alone."""
+    messages_per_scan: int = static(0, least=0)
+    """Number of a bag's messages that are joined to one scan; 0: 1, or as many as hold a turn of a spinning
+    LiDAR whose messages hold parts of it."""
     beams: int = static(0, least=0)
     """Beams for ring reconstruction where the recording holds no ring; 0: 16, 32 or 64 by the data."""
     scan_period: float = static(0.1, "s", above=0)

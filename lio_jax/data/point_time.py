@@ -109,7 +109,7 @@ class PointTiming:
         since = (time - time.dtype.type(zero)) * tick
         start_ns = header_ns
         if self.anchor == "points":
-            start_ns = _ticks_to_ns(low, self.tick_ns)
+            start_ns = ticks_to_ns(low, self.tick_ns)
         elif self.anchor == "end":
             start_ns = header_ns - round(duration * 1e9)
         elif self.anchor == "inside":
@@ -210,7 +210,7 @@ def _anchor(
         return stamp_end(samples, sweep, config)
     if absolute:
         # Place of the header in the scan on the points' own clock: 0 is its start, 1 its end.
-        offsets = [(s.header_ns - _ticks_to_ns(s.low, tick_ns)) * 1e-9 for s in samples]
+        offsets = [(s.header_ns - ticks_to_ns(s.low, tick_ns)) * 1e-9 for s in samples]
         place = float(np.median(offsets)) / sweep
         if -1.0 < place < 2.0:
             word = (
@@ -246,7 +246,7 @@ def _header(sample: TimeSample) -> int:
     return sample.header_ns
 
 
-def _ticks_to_ns(ticks: float | int, tick_ns: int) -> int:
+def ticks_to_ns(ticks: float | int, tick_ns: int) -> int:
     """Convert exactly: seconds since the epoch times 1e9 would lose 100 ns in a double."""
     whole = math.floor(ticks)
     return whole * tick_ns + round((ticks - whole) * tick_ns)

@@ -3,15 +3,12 @@
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from copy import copy
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data import navigation_messages, pointcloud2, static_transforms
+from lio_jax.data import navigation_messages, pointcloud2
+from lio_jax.data.bag_extrinsic import bag_extrinsic
 from lio_jax.data.bag_files import (
     BagContents,
     Topic,
@@ -20,19 +17,18 @@ from lio_jax.data.bag_files import (
     choose_topic,
     listed,
     open_bag,
-    read_frame,
     read_header,
     until_damage,
-    why,
 )
 from lio_jax.data.cloud_fields import RawCloud
 from lio_jax.data.config import DataConfig
 from lio_jax.data.imu_checks import accel_scale
+from lio_jax.data.joined_messages import Joining, Part, grouped, order_of
 from lio_jax.data.navigation_messages import GpsCollector, ImuCollector
+from lio_jax.data.part_recognition import recognise_messages
 from lio_jax.data.pointcloud2 import decode_cloud
-from lio_jax.data.scan_reading import ScanReading, recognise_clouds
+from lio_jax.data.scan_reading import ScanReading
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog, entries
-from lio_jax.data.static_transforms import Transforms, constant, frame_name, gathered, transform_between
 from lio_jax.data.time_order import Stamped, in_time_order
 from lio_jax.data.trajectory import Trajectory
 
@@ -42,9 +38,6 @@ if TYPE_CHECKING:
 _LIDAR_TYPES = dict.fromkeys((pointcloud2.TYPE, *sorted(pointcloud2.LIVOX_TYPES)), "a point cloud")
 _IMU_TYPES = {navigation_messages.TYPE: "an Imu"}
 _GPS_TYPES = {navigation_messages.FIX_TYPE: "a NavSatFix", navigation_messages.ODOMETRY_TYPE: "an Odometry"}
-_STATIC = (static_transforms.TOPIC, static_transforms.TYPE)
-_REPEATS_LOOKED_AT = 200
-"""Number of messages of /tf that are looked at in each third of a bag."""
 _GPS_NAMES = ("gps", "gnss", "rtk")
 
 
@@ -66,15 +59,19 @@ class RosbagSequence:
         self._warnings = WarningLog()
         self._samples: tuple[ImuData | None, GpsData | None] | None = None
         self._received: tuple[int | None, int | None] = (None, None)
+        self._whole = self
+        self._sweeps: list[int] | None = None
         with open_bag(self._paths) as reader:
             topics = bag_topics(reader.connections)
             self._notes = [f"{len(self._paths)} files read as one recording"] if len(self._paths) > 1 else []
             self._lidar = self._choose_lidar(topics)
             self._imu_topic = self._choose("imu_topic", config.imu_topic, topics, _IMU_TYPES)
             self._gps_topic = self._choose_gps(topics)
-            self._reading = self._recognised(reader)
-            self._T_imu_lidar = self._extrinsic(reader, topics)
-        self._notes.extend(self._reading.notes)
+            self._reading, self._joining = self._recognised(reader)
+            self._T_imu_lidar, tied = bag_extrinsic(
+                reader, topics, self._imu_topic, self._lidar, self._damaged_topic
+            )
+        self._notes += [*([tied] if tied else []), *self._reading.notes]
 
     @property
     def info(self) -> SequenceInfo:
@@ -83,7 +80,7 @@ class RosbagSequence:
             name=self._path.name if self._path.is_dir() else self._path.stem,
             format="rosbag",
             path=str(self._path),
-            scan_count=self._lidar.count,
+            scan_count=self._lidar.count if self._joining is None else len(self._whole._first_messages()),
             T_imu_lidar=self._T_imu_lidar,
             notes=tuple(self._notes),
         )
@@ -99,23 +96,67 @@ class RosbagSequence:
         If the bag turns out to be damaged, the iteration ends with a warning. A message that cannot be
         decoded, a duplicate, a step back in time and a wrong stamp are left out with a warning.
         """
+        if self._joining is not None:
+            yield from self._joined(self._joining, start, count)
+            return
         yield from in_time_order(self._decoded(start, count), self._warnings.add)
 
     def _decoded(self, start: int, count: int | None) -> Iterator[Stamped[LidarScan]]:
+        stop = None if count is None else start + count
         with open_bag(self._paths) as reader:
-            for number, raw in self._lidar_messages(reader):
-                if count is not None and number >= start + count:
-                    return
-                if number < start:
-                    continue
+            for number, cloud in self._clouds(reader, start, stop, self._warnings.add):
                 name = f"{self._path.name}: scan {number}"
-                try:
-                    cloud = decode_cloud(reader, self._lidar, raw, self._config.time_field, self._where)
-                except ValueError as error:
-                    self._warnings.add(f"{name} cannot be read and was skipped: {error}.")
-                    continue
                 scan = self._reading.scan(cloud, name, self._warnings.add)
                 yield Stamped(scan.stamp_ns, name, scan)
+
+    def _joined(self, joining: Joining, start: int, count: int | None) -> Iterator[LidarScan]:
+        firsts = self._first_messages() if start else [0]
+        if start >= len(firsts):
+            return
+        with open_bag(self._paths) as reader:
+            for number, parts in enumerate(
+                self._parts(reader, joining, firsts[start], self._warnings.add), start
+            ):
+                if count is not None and number >= start + count:
+                    return
+                whole = joining.whole([part.cloud for part in parts])
+                yield self._reading.scan(whole, f"{self._path.name}: scan {number}", self._warnings.add)
+
+    def _first_messages(self) -> list[int]:
+        """Return the number of the first message of each scan: a pass over all messages, once."""
+        if self._sweeps is None:
+            assert self._joining is not None
+            with open_bag(self._paths) as reader:
+                sweeps = self._parts(reader, self._joining, 0, lambda sentence: None)
+                self._sweeps = [parts[0].number for parts in sweeps]
+        return self._sweeps
+
+    def _parts(
+        self, reader: "AnyReader", joining: Joining, first: int, warn: Callable[[str], None]
+    ) -> Iterator[list[Part]]:
+        """Yield the messages of each sweep, from the given message on."""
+
+        def stamped() -> Iterator[Stamped[Part]]:
+            for number, cloud in self._clouds(reader, first, None, warn):
+                start_ns = joining.start_ns(cloud)
+                yield Stamped(start_ns, f"{self._path.name}: message {number}", Part(number, start_ns, cloud))
+
+        return grouped(in_time_order(stamped(), warn), order_of(joining), first == 0)
+
+    def _clouds(
+        self, reader: "AnyReader", start: int, stop: int | None, warn: Callable[[str], None]
+    ) -> Iterator[tuple[int, RawCloud]]:
+        """Yield the clouds of messages ``start`` to ``stop`` with their numbers, damaged ones left out."""
+        for number, raw in self._lidar_messages(reader, warn):
+            if stop is not None and number >= stop:
+                return
+            if number < start:
+                continue
+            try:
+                yield number, decode_cloud(reader, self._lidar, raw, self._config.time_field, self._where)
+            except ValueError as error:
+                name = f"{self._path.name}: {self._unit} {number}"
+                warn(f"{name} cannot be read and was skipped: {error}.")
 
     def within(self, start_ns: int, end_ns: int) -> "RosbagSequence":
         """Return the part whose messages were received from ``start_ns`` up to ``end_ns``.
@@ -125,6 +166,7 @@ class RosbagSequence:
         """
         part = copy(self)
         part._received, part._samples, part._warnings = (start_ns, end_ns), None, WarningLog()
+        part._sweeps = None
         part._notes = list(self._notes)
         return part
 
@@ -132,7 +174,7 @@ class RosbagSequence:
         """Return what the bag's index and its first cloud state."""
         fields: tuple[str, ...] = ()
         with open_bag(self._paths) as reader:
-            for _, raw in self._lidar_messages(reader):
+            for _, raw in self._lidar_messages(reader, self._warnings.add):
                 if self._lidar.type in pointcloud2.LIVOX_TYPES:
                     fields = pointcloud2.custom_msg_field_names()
                 else:
@@ -153,7 +195,7 @@ class RosbagSequence:
     def header_stamps(self) -> Iterator[int]:
         """Yield the header stamp in ns of every cloud without decoding any."""
         with open_bag(self._paths) as reader:
-            for _, raw in self._lidar_messages(reader):
+            for _, raw in self._lidar_messages(reader, self._warnings.add):
                 yield read_header(raw, reader.is2).stamp_ns
 
     def imu(self) -> ImuData | None:
@@ -167,6 +209,14 @@ class RosbagSequence:
     def truth(self) -> Trajectory | None:
         """Return None: a bag states no ground truth."""
         return None
+
+    @property
+    def _unit(self) -> str:
+        """Return what a message is called in warnings."""
+        return "scan" if self._joining is None else "message"
+
+    def _damaged_topic(self, topic: str, reason: str) -> None:
+        self._warnings.add(f"{self._path}: {topic} is damaged ({reason}).")
 
     @property
     def _where(self) -> str:
@@ -193,8 +243,8 @@ class RosbagSequence:
             )
         return lidar
 
-    def _recognised(self, reader: "AnyReader") -> ScanReading:
-        """Settle from the topic's first clouds with points how its clouds are read."""
+    def _recognised(self, reader: "AnyReader") -> tuple[ScanReading, Joining | None]:
+        """Settle from the topic's first clouds with points how its clouds are read and joined."""
         undecoded: list[str] = []
         damage: list[str] = []
 
@@ -208,67 +258,13 @@ class RosbagSequence:
                     continue
                 yield cloud, received_ns
 
-        reading = recognise_clouds(decoded(), self._config, self._where)
-        if reading is None:
+        found = recognise_messages(decoded(), self._config, self._where)
+        if found is None:
             reason = "".join(f" ({cause})" for cause in [*damage, *undecoded][-1:])
             raise LioJaxError(
                 f"{self._where}: no point cloud can be read{reason}; the recording is empty or damaged there."
             )
-        return reading
-
-    def _extrinsic(self, reader: "AnyReader", topics: tuple[Topic, ...]) -> NDArray[np.float64] | None:
-        """Return the lidar's pose in the IMU frame if the bag's static transforms state it."""
-        static = [topic for topic in topics if (topic.name, topic.type) == _STATIC]
-        repeated = [topic for topic in topics if topic.name == static_transforms.REPEATED_TOPIC]
-        repeated = [topic for topic in repeated if topic.type in static_transforms.REPEATED_TYPES]
-        if self._imu_topic is None or not (static or repeated):
-            return None
-        frames = [self._frame(reader, topic) for topic in (self._imu_topic, self._lidar)]
-        if None in frames or frames[0] == frames[1]:
-            # drivers with default settings share one frame name
-            return None
-        imu, lidar = map(str, frames)
-
-        known: Transforms = {}
-        for topic in [*static, *repeated]:
-            known = self._transforms(reader, topic) | known
-            T_imu_lidar = transform_between(known, imu, lidar)
-            if T_imu_lidar is not None:
-                self._notes.append(f"T_imu_lidar: {topic.name} states the pose of {lidar} in {imu}")
-                return T_imu_lidar
-        looked_at = " and ".join(topic.name for topic in [*static, *repeated])
-        do = "does" if len(static) + len(repeated) == 1 else "do"
-        self._notes.append(f"T_imu_lidar: {looked_at} {do} not tie {lidar} to {imu}")
-        return None
-
-    def _transforms(self, reader: "AnyReader", topic: Topic) -> Transforms:
-        """Return the transforms that a topic states for the whole recording."""
-
-        def broken(reason: str) -> None:
-            self._warnings.add(f"{self._path}: {topic.name} is damaged ({reason}).")
-
-        is_static = topic.name == static_transforms.TOPIC
-        messages = self._messages(reader, topic) if is_static else self._spread(reader, topic)
-        decoded = (reader.deserialize(raw, topic.type) for _, _, raw in until_damage(messages, broken))
-        try:
-            return gathered(decoded) if is_static else constant(decoded)
-        # The generated decoders raise exceptions of many kinds on damaged bytes.
-        except Exception as error:
-            broken(why(error))
-            return {}
-
-    def _spread(self, reader: "AnyReader", topic: Topic) -> Iterator[tuple[Any, int, bytes]]:
-        """Yield messages from three parts of the bag: what stands still at first may move later."""
-        connections = [c for c in reader.connections if (c.topic, c.msgtype) == (topic.name, topic.type)]
-        for part in range(3):
-            start = reader.start_time + part * (reader.end_time - reader.start_time) // 3
-            yield from islice(reader.messages(connections, start=start), _REPEATS_LOOKED_AT)
-
-    def _frame(self, reader: "AnyReader", topic: Topic) -> str | None:
-        for _, _, raw in until_damage(self._messages(reader, topic), lambda reason: None):
-            with suppress(ValueError):
-                return frame_name(read_frame(raw, reader.is2))
-        return None
+        return found
 
     def _choose_gps(self, topics: tuple[Topic, ...]) -> Topic | None:
         """Take an Odometry as GPS only if asked for or named so: most are the output of an estimator."""
@@ -284,13 +280,15 @@ class RosbagSequence:
             )
         return self._choose("gps_topic", "", fixes or named, _GPS_TYPES)
 
-    def _lidar_messages(self, reader: "AnyReader") -> Iterator[tuple[int, bytes]]:
+    def _lidar_messages(
+        self, reader: "AnyReader", warn: Callable[[str], None]
+    ) -> Iterator[tuple[int, bytes]]:
         last = -1
 
         def broken(reason: str) -> None:
-            self._warnings.add(
-                f"{self._path}: the bag is damaged after scan {last} of {self._lidar.count} ({reason}): "
-                "reading ended there."
+            warn(
+                f"{self._path}: the bag is damaged after {self._unit} {last} of {self._lidar.count} "
+                f"({reason}): reading ended there."
             )
 
         for number, (_, _, raw) in enumerate(until_damage(self._messages(reader, self._lidar), broken)):
@@ -389,6 +387,7 @@ READER = Reader(
             "stamp_at",
             "accel_unit",
             "compensated",
+            "messages_per_scan",
             "beams",
             "scan_period",
         ]

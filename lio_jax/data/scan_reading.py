@@ -1,7 +1,7 @@
 """Turn clouds into LidarScans, after recognising from the first clouds how they state times and rings."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -76,8 +76,24 @@ class ScanReading:
         return start_ns, seconds, duration, keep
 
 
+def first_clouds(clouds: Iterable[tuple[RawCloud, int]]) -> list[tuple[RawCloud, int]]:
+    """Return the first clouds, up to those with points from which the reading is recognised."""
+    taken: list[tuple[RawCloud, int]] = []
+    with_points = 0
+    for cloud in clouds:
+        taken.append(cloud)
+        with_points += bool(len(cloud[0].points))
+        if with_points == SCANS_LOOKED_AT:
+            break
+    return taken
+
+
 def recognise_clouds(
-    clouds: Iterable[tuple[RawCloud, int]], config: DataConfig, where: str, stamped: bool = True
+    clouds: Iterable[tuple[RawCloud, int]],
+    config: DataConfig,
+    where: str,
+    stamped: bool = True,
+    known_whole: bool = False,
 ) -> ScanReading | None:
     """Settle from the first clouds with points how clouds are read; None where there are no clouds.
 
@@ -86,46 +102,71 @@ def recognise_clouds(
         config: settings that override what is recognised.
         where: what is read, in errors.
         stamped: whether the clouds' stamps are recorded; false where they are only counted.
+        known_whole: whether the clouds are known to be scans, so that no note doubts it.
 
     Raises:
         UsageError: the settings name a number of beams that the points do not fit.
     """
-    first: RawCloud | None = None
-    sectors: list[frozenset[int]] = []
-    headers: list[int] = []
-    samples: list[TimeSample] = []
-    beams: list[int] = []
-    kind = ""
-    for cloud, received_ns in clouds:
-        if first is None or not len(first.points):
-            first = cloud
-        if not len(cloud.points):
-            continue
-        headers.append(cloud.stamp_ns)
-        sectors.append(_sectors(cloud.points))
-        if cloud.ring is None:
-            beams.append(config.beams or guess_beams(cloud.points))
-        low, high = cloud.time_range or (0, 0)
-        if cloud.time is not None:
-            kind = cloud.time.dtype.name
-        samples.append(TimeSample(cloud.stamp_ns, received_ns, low, high))
-        if len(headers) == SCANS_LOOKED_AT:
-            break
-    if first is None:
+    taken = first_clouds(clouds)
+    if not taken:
         return None
-    chosen_beams = max(set(beams), key=beams.count) if beams else config.beams or 16
-    ring_note = (*_ring_note(first, chosen_beams, config.beams > 0, where), *_parts_note(sectors))
+    reading = recognise_times(taken, config, stamped)
+    beams, ring_notes = recognise_rings([cloud for cloud, _ in taken], config, where)
+    sectors = [] if known_whole else [_sectors(cloud.points) for cloud, _ in taken if len(cloud.points)]
+    return replace(reading, beams=beams, notes=(*reading.notes, *ring_notes, *_parts_note(sectors)))
+
+
+def recognise_times(
+    clouds: Sequence[tuple[RawCloud, int]], config: DataConfig, stamped: bool = True
+) -> ScanReading:
+    """Settle how clouds state their times; the number of beams is left open.
+
+    Args:
+        clouds: at least one cloud with the time of its receipt, ns, in recorded order.
+        config: settings that override what is recognised.
+        stamped: whether the clouds' stamps are recorded.
+    """
     if config.compensated == "yes":
-        time_note = "points are taken as motion compensated to the header stamp (config.data.compensated)"
-        return ScanReading(None, "start", 0.0, chosen_beams, (time_note, *ring_note))
-    timing = recognise_point_time(samples, first.time_field, kind, config, stamped) if kind else None
+        note = "points are taken as motion compensated to the header stamp (config.data.compensated)"
+        return ScanReading(None, "start", 0.0, 0, (note,))
+    with_points = [(cloud, received_ns) for cloud, received_ns in clouds if len(cloud.points)]
+    samples = [
+        TimeSample(cloud.stamp_ns, received_ns, *(cloud.time_range or (0, 0)))
+        for cloud, received_ns in with_points
+    ]
+    kind = next((c.time.dtype.name for c, _ in reversed(with_points) if c.time is not None), "")
+    field = _first_with_points([cloud for cloud, _ in clouds]).time_field
+    timing = recognise_point_time(samples, field, kind, config, stamped) if kind else None
     if timing is not None:
-        return ScanReading(timing, "start", timing.sweep, chosen_beams, (timing.note, *ring_note))
-    period = scan_period(headers, config.scan_period)
+        return ScanReading(timing, "start", timing.sweep, 0, (timing.note,))
+    period = scan_period([sample.header_ns for sample in samples], config.scan_period)
     stamp_at, note = stamp_end(samples, period, config) if samples else ("start", "no points in any cloud")
-    missing = f"field {first.time_field!r} holds a single value" if first.time_field else "not recorded"
+    missing = f"field {field!r} holds a single value" if field else "not recorded"
     time_note = f"per-point time: {missing}, reconstructed from azimuth over {period:.4g} s a scan, {note}"
-    return ScanReading(None, stamp_at, period, chosen_beams, (time_note, *ring_note))
+    return ScanReading(None, stamp_at, period, 0, (time_note,))
+
+
+def recognise_rings(
+    clouds: Sequence[RawCloud], config: DataConfig, where: str
+) -> tuple[int, tuple[str, ...]]:
+    """Return the number of beams for the reconstruction of rings, and a note where rings are missing.
+
+    Args:
+        clouds: at least one cloud.
+        config: the number of beams where it is given.
+        where: what is read, in errors.
+
+    Raises:
+        UsageError: the settings name a number of beams that the points do not fit.
+    """
+    bare = [cloud for cloud in clouds if len(cloud.points) and cloud.ring is None]
+    beams = [config.beams or guess_beams(cloud.points) for cloud in bare]
+    chosen = max(set(beams), key=beams.count) if beams else config.beams or 16
+    return chosen, _ring_note(_first_with_points(clouds), chosen, config.beams > 0, where)
+
+
+def _first_with_points(clouds: Sequence[RawCloud]) -> RawCloud:
+    return next((cloud for cloud in clouds if len(cloud.points)), clouds[-1])
 
 
 _SECTORS = 36
@@ -147,7 +188,8 @@ def _parts_note(sectors: list[frozenset[int]]) -> tuple[str, ...]:
         return ()
     sentence = (
         f"each cloud holds a part of a sweep only (at most {10 * largest} deg of azimuth) and is read as a "
-        "scan of its own; let the driver publish whole sweeps"
+        "scan of its own; let the driver publish whole sweeps, or join N messages of a bag with "
+        "config.data.messages_per_scan=N"
     )
     return (sentence,)
 

@@ -215,9 +215,9 @@ def test_two_returns_of_a_firing_share_its_time_and_ring(tmp_path: Path, layout:
 
 
 def test_messages_that_hold_parts_of_a_sweep_are_noticed(tmp_path: Path) -> None:
-    """A Velodyne driver whose npackets is a fifth of a turn's packets."""
+    """A Velodyne driver whose npackets is a fifth of a turn's packets; a single turn shows no rate."""
     messages = []
-    for stamp in scan_starts(2):
+    for stamp in scan_starts(1):
         for part in range(5):
             inside = np.floor(SEEN.time / 0.02 + 1e-6) == part
             cloud = bags.fill(bags.VELODYNE, SEEN, SEEN.time - 0.02 * part)[inside]
