@@ -89,6 +89,7 @@ KINDS = (
     _bag("messages", "ros1", "a.bag", "messages"),
     _bag("livox", "livox", "a.bag", "messages"),
     _bag("ouster", "ouster", "a.bag", "messages"),
+    _bag("parts", "parts", "a.bag", "messages"),
     _bag("mcap", "mcap", "a.mcap", "mcap"),
     _bag("sqlite", "sqlite", "a.db3", "sqlite"),
     Kind(

@@ -1,6 +1,7 @@
 """Small healthy inputs for the campaign: recordings in every format, poses, graphs, settings, a run."""
 
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -135,6 +136,10 @@ def write_seeds(root: Path, run: Run, with_run: bool) -> None:
     ):
         out = root / folder / name
         must("export", native, "--to", "bag", "--layout", layout, "--out", out)
+    turns = root / "parts" / "drive"
+    write_native(turns, [part for number in range(_SCANS) for part in _fifths(_scan(number))], imu=_imu(80))
+    must("export", turns, "--to", "bag", "--layout", "velodyne", "--out", root / "parts" / "a.bag")
+    shutil.rmtree(turns)
     must("export", native, "--to", "kitti", "--out", root / "kitti" / "04")
     _write_kitti_raw(root / "kitti_raw" / "day")
     _write_clouds(root / "clouds")
@@ -165,6 +170,21 @@ def _scan(number: int) -> LidarScan:
         (column % 200).astype(np.float32),
         0.1,
     )
+
+
+def _fifths(scan: LidarScan) -> Iterator[LidarScan]:
+    """Yield five scans that hold a fifth of the sweep each, as a driver of small messages publishes them."""
+    share = scan.duration / 5
+    for number in range(5):
+        kept = (scan.time * 5 // scan.duration).astype(int) == number
+        yield LidarScan(
+            scan.stamp_ns + round(number * share * 1e9),
+            scan.points[kept],
+            (scan.time[kept] - number * share).astype(np.float32),
+            scan.ring[kept],
+            scan.intensity[kept],
+            share,
+        )
 
 
 def _imu(count: int) -> ImuData:
