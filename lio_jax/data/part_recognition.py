@@ -163,7 +163,7 @@ def _note(joining: Joining, config: DataConfig) -> str:
             "(config.data.messages_per_scan)"
         )
     number = f"{joining.messages:.4g}"
-    start = f"{np.degrees(turning.start) % 360:.0f}"
+    start = round(np.degrees(turning.start)) % 360
     sentence = (
         f"each message holds a part of a turn: {number} messages are joined to a scan of "
         f"{joining.period:.3g} s, which starts at {start} deg of azimuth"
