@@ -33,7 +33,7 @@ from lio_jax.recipes.inertial_filter import (
     registration_of,
 )
 from lio_jax.recipes.recipe import Outage, Output
-from lio_jax.registration.point_evidence import point_evidence
+from lio_jax.registration.point_evidence import point_evidence, shown_by_noise
 from lio_jax.registration.scan_match import FixedPoints
 from lio_jax.registration.voxel_planes import ScanToVoxels
 
@@ -157,6 +157,16 @@ def step(
         coordinates = matches.coordinates_in(state.map)
         slots = len(state.map.voxel)
         evidence = point_evidence(slots, matches, to_match, T_matched, frame, *sigmas, coordinates)
+        by_noise = shown_by_noise(
+            state.map,
+            matches,
+            to_match,
+            T_matched,
+            frame,
+            params.lidar,
+            params.registration.kernel,
+            update.measurement.aux.equations,
+        )
         missed = jnp.linalg.norm((T_predicted.inverse() @ T_matched).translation())
         error = jnp.maximum(params.motion.error_decay * state.prediction_error, missed)
     with jax.named_scope("insert"):
@@ -203,6 +213,7 @@ def step(
         covariance=drift.added_to(within),
         new_piece=new_piece,
         evidence=evidence_of(update, prior, evidence),
+        shown_by_noise=by_noise,
     )
 
 

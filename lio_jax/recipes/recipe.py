@@ -79,6 +79,10 @@ class Output(eqx.Module):
     velocity, and zeros otherwise. None from recipes without a covariance."""
     evidence: Evidence | None = None
     """Statistics of the match as an update of the prediction; None from recipes without a filter."""
+    shown_by_noise: Float[Array, "6 3"] | None = None
+    """Directions of motion of which noise alone may have given all information that the match has, as
+    :func:`lio_jax.registration.point_evidence.shown_by_noise` returns them; None from recipes that do not
+    look for them."""
     log_evidence: Float[Array, ""] | None = None
     """Log marginal likelihood of all measurements since the smoother's start; None without a smoother."""
     too_few_features: Bool[Array, ""] | None = None

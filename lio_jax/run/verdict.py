@@ -53,6 +53,9 @@ deviations of the position, m: a vehicle that accelerates by 0.5 m/s^2 moves by 
 velocity of before does not show it."""
 _SIGMAS = 4.0
 """Such a time counts where so many standard deviations of the position exceed the tolerated error."""
+_BY_NOISE_M = 0.25
+"""Estimated motion in a direction that noise alone may show that counts, m: half of the error that a warning
+is to precede. The motion in truth may be none."""
 _HIDDEN_LOOKS = 2
 """Number of successive plan views without a certain motion from which it counts as hidden."""
 
@@ -67,6 +70,12 @@ class _Evidence:
     """Time of the last scan that showed all directions, s."""
     unobserved_m: float = 0.0
     contradictions: int = 0
+    by_noise: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    """(3,) motion in directions that noise alone may show, since the last scan without any, m."""
+    noise_believed: bool = False
+    """Whether a match since that scan has used what it knows of such a direction."""
+    by_noise_since_s: float = 0.0
+    """Time of that scan, s."""
     hidden_m: float = 0.0
     hidden_since_s: float = 0.0
     hidden_looks: int = 0
@@ -108,6 +117,7 @@ class Verdict(Sink):
         self._note_felt(result)
         self._note_window(result, sigma)
         self._note_unobserved(result, step, sigma)
+        self._note_by_noise(result)
         self._note_hidden(result, step)
         self._note_jumps(result)
         self._before = result
@@ -258,6 +268,36 @@ class Verdict(Sink):
                 "unobserved",
                 f"up to {self._now_s:.1f} s no scan showed one direction of the motion for {since_s:.1f} s, "
                 f"and the position's standard deviation is {sigma:.1f} m",
+            )
+
+    def _note_by_noise(self, result: ScanResult) -> None:
+        """Add up the motion that the match has found in directions of which it may know noise alone.
+
+        Where all matches leave a direction to the prediction, the covariance grows with the error. Once one
+        has believed the noise, the velocity is wrong, and later predictions are. Plan views show a horizontal
+        motion by themselves.
+        """
+        output, seen, before = result.output, self._seen, self._before
+        if before is None or output.shown_by_noise is None or bool(output.lost):
+            return
+        rows = np.asarray(output.shown_by_noise, np.float64)
+        if not rows.any():
+            seen.by_noise, seen.by_noise_since_s, seen.noise_believed = np.zeros(3), self._now_s, False
+            return
+        seen.noise_believed |= bool(rows[~np.asarray(output.registration.degenerate)].any())
+        if seen.noise_believed:
+            moved = (result.T_world_imu - before.T_world_imu)[:3, 3]
+            seen.by_noise = seen.by_noise + np.linalg.pinv(rows) @ (rows @ moved)
+        if result.shown_motion is not None:
+            seen.by_noise[:2] = 0.0
+        unseen = seen.by_noise * ([1, 1, 1] if _is_true(result.motion_is_hidden) else [0, 0, 1])
+        if (way := float(np.linalg.norm(unseen))) > _BY_NOISE_M:
+            along = "upwards or downwards " if abs(unseen[2]) > _VERTICAL * way else ""
+            self._doubt(
+                "noise",
+                f"from {seen.by_noise_since_s:.1f} s to {self._now_s:.1f} s the estimate moves {along}by "
+                f"{way:.1f} m in a direction that no scan shows: what the map seems to tell of it may be "
+                "noise alone, and neither this motion nor its standard deviation can be trusted",
             )
 
     def _note_hidden(self, result: ScanResult, step: float) -> None:

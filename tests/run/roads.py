@@ -14,9 +14,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "experiments" / "be
 
 from hard_runs import moves as steps
 from hard_runs import relative
+from hard_scenes import lift_without_floor
 from roads import driven_along, road_scene
 
-__all__ = ["relative", "road", "steps", "tracked"]
+__all__ = ["lift_without_floor", "relative", "road", "steps", "tracked"]
 
 
 @cache

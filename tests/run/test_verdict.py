@@ -17,7 +17,7 @@ from lio_jax.run.verdict import Verdict, in_words
 from lio_jax.settings.settings import recipe_settings
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
-from tests.run.roads import relative, road, steps, tracked
+from tests.run.roads import lift_without_floor, relative, road, steps, tracked
 from tests.run.test_first_velocity import DRIVE
 from tests.shared_data import needs_shared
 
@@ -295,3 +295,51 @@ def test_without_inertial_samples_a_hidden_direction_is_doubtful_earlier(sigma, 
     if is_doubted:
         assert found["since_s"] == pytest.approx(0.7 + 1.6, abs=0.01)
         assert "no inertial samples bridge it" in found["reasons"][0]
+
+
+@pytest.mark.parametrize(
+    "case", ["upwards", "along, hidden", "along, not looked at", "along, shown", "dropped"]
+)
+def test_a_motion_that_noise_alone_may_show_is_doubtful(case):
+    settings, results = tracked(road("street", 5.0, 0.0, 8), "default")
+    output = results[-1].output
+    assert output.shown_by_noise.shape == (6, 3)
+    axis = 0 if case.startswith("along") else 2
+
+    def blind(number):
+        is_dropped = case == "dropped" or (case == "dropped later" and number > 1)
+        dropped = (jnp.arange(6) == 0) & is_dropped
+        return replace(
+            output,
+            shown_by_noise=jnp.zeros((6, 3)).at[0, axis].set(1.0),
+            registration=replace(output.registration, degenerate=dropped),
+        )
+
+    hidden = {"along, hidden": True, "along, shown": False}.get(case)
+    shown = ShownMotion(0.02, 0.5, 0.0, 5) if case == "along, shown" else None
+    onwards = []
+    for result in drives_on(results, 12, output=blind):
+        pose = result.T_world_imu.copy()
+        pose[2, 3] += 0.05 * (len(onwards) + 1) * (axis == 2)
+        onwards.append(
+            replace(result, T_world_imu=pose, motion_is_hidden=hidden, shown_motion=shown, felt_motion=None)
+        )
+    found = verdict_of(settings, [*results, *onwards])
+    is_doubted = case in ("upwards", "along, hidden", "dropped later")
+    assert (found["state"] != "sound") == is_doubted
+    if is_doubted:
+        assert "no scan shows" in found["reasons"][0]
+        assert ("upwards or downwards" in found["reasons"][0]) == (axis == 2)
+        assert found["since_s"] == pytest.approx(0.7 + (0.6 if axis == 2 else 0.1), abs=0.01)
+
+
+def test_between_smooth_walls_a_wrong_height_is_doubted_before_it_is_half_a_metre_off():
+    sequence = lift_without_floor(0)
+    settings, results = tracked(sequence, "default", scans=list(sequence.scans(0, 28)))
+    poses, truth = relative(results, sequence)
+    error = np.linalg.norm((poses - truth)[:, :3, 3], axis=1)
+    assert error.max() > 0.3
+    found = verdict_of(settings, results[: 1 + int(np.argmax(error > 0.5)) or None])
+    assert found["state"] == "doubtful"
+    assert "upwards or downwards" in found["reasons"][0]
+    assert "no scan shows" in found["reasons"][0]
