@@ -14,6 +14,7 @@ from lio_jax.core.error_state import DOF, GRAVITY, NavEstimate, sphere_basis
 from lio_jax.core.geometry import rotation_matrix
 from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.types import ITERATION_LIMIT, ImuBatch, NavState, Scan
+from lio_jax.core.xla import computed_once
 from lio_jax.estimation.map_drift import MapDrift
 from lio_jax.imu.path import Path, deskew_along
 from lio_jax.lidar.thinning import ThinnedScan, thinned
@@ -172,6 +173,8 @@ def step(
     with jax.named_scope("insert"):
         _, placed = jax.lax.stop_gradient(frame.place(points, T_matched))
         inserted, size = thin.mask & (~lost | new_piece), params.map.voxel_size.astype(jnp.float32)
+        # XLA copies a map that is read after it is written: what has read it comes first
+        inserted, by_noise = computed_once((inserted, by_noise))
         vmap, added = insert(
             state.map, placed, inserted, frame.anchor, size, params.map.reach.astype(jnp.float32)
         )

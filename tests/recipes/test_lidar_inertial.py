@@ -1,5 +1,6 @@
 """The tightly coupled recipe on simulated recordings whose truth and noise are known."""
 
+import re
 from dataclasses import dataclass
 from functools import cache
 
@@ -97,6 +98,15 @@ def test_inertial_samples_hold_a_fast_handheld_walk():
     assert not any(item.output.lost for item in coupled.tracked)
     assert coupled.ate < 0.01
     assert coupled.ate < 0.5 * alone.ate
+
+
+def test_the_map_is_written_where_it_lies():
+    """A copy of it takes longer than the match where the map is large."""
+    drive("city", 2.0)
+    for program in compiled().step_programs._programs.values():
+        text = program.as_text()
+        assert "f32[32768,10]" in text
+        assert not re.search(r"= f32\[32768,10\]\S* copy\(", text)
 
 
 def test_a_moving_start_is_found():
