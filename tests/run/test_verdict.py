@@ -15,7 +15,6 @@ from lio_jax.run.scan_inputs import padded
 from lio_jax.run.shown_motion import MotionCheck, ShownMotion
 from lio_jax.run.verdict import Verdict, in_words
 from lio_jax.settings.settings import recipe_settings
-from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence
 from tests.run.roads import lift_without_floor, relative, road, steps, tracked
 from tests.run.test_first_velocity import DRIVE
@@ -173,14 +172,13 @@ def test_a_direction_that_only_inertial_samples_show_is_doubtful_after_five_seco
 
 @pytest.mark.long
 def test_a_drone_over_a_field_warns_before_it_is_a_metre_off():
-    sequence = SimulatedSequence("field", duration_s=11.0, seed=1, imu=ImuModel())
-    settings, results = tracked(sequence, "lio_sam")
+    """Without inertial samples: with them no recipe is a metre off in this time."""
+    sequence = SimulatedSequence("field", duration_s=11.0, seed=1)
+    settings, results = tracked(sequence, "loam")
     poses, truth = relative(results, sequence)
-    error = np.linalg.norm((poses - truth)[:, :3, 3], axis=1)
-    assert error[-1] > 0.8
-    found = verdict_of(settings, results)
-    assert found["state"] != "sound"
-    assert found["since_s"] <= 0.1 * (np.argmax(error > 1) or len(error))
+    off = np.linalg.norm((poses - truth)[:, :3, 3], axis=1) > 1
+    assert off.any()
+    assert verdict_of(settings, results[: int(np.argmax(off)) + 1])["state"] != "sound"
 
 
 @pytest.mark.parametrize(("error", "state"), [(0.4, "sound"), (0.6, "doubtful")])
