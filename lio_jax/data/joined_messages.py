@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.data.cloud_fields import RawCloud
-from lio_jax.data.point_time import PointTiming, ticks_to_ns
+from lio_jax.data.point_time import PointTiming
 from lio_jax.data.turning import Arc, Turning, arc_of
 
 
@@ -50,9 +50,7 @@ class Joining:
         if timing is None or limits is None:
             return cloud.stamp_ns
         low, high = limits
-        if timing.absolute:
-            return ticks_to_ns(low, timing.tick_ns) if timing.anchor == "points" else cloud.stamp_ns
-        return cloud.stamp_ns + round((low + _header_tick(timing, low, high)) * timing.tick_ns)
+        return timing.at_ns(cloud.stamp_ns, low, low, high)
 
     def limits(self, cloud: RawCloud) -> tuple[float, float] | None:
         """Return the smallest and the largest possible tick of a message; None where there is none."""
@@ -113,11 +111,11 @@ class Joining:
         if part.time is None or timing.absolute:
             return part.time, part.time_range
         limits = self.limits(part)
-        header = 0.0 if limits is None else _header_tick(timing, *limits)
+        header = 0.0 if limits is None else float(timing.header_tick(*limits))
 
         def since(ticks: NDArray[np.float64]) -> NDArray[np.float64]:
             # float64 states times from a stamp to far less than a ns; the reading drops impossible ones
-            return (np.clip(ticks, -_FARTHEST, _FARTHEST) + header) * timing.tick_ns + later
+            return (np.clip(ticks, -_FARTHEST, _FARTHEST) - header) * timing.tick_ns + later
 
         times = since(part.time.astype(np.float64))
         if part.time_range is None:
@@ -140,14 +138,6 @@ class Joining:
 
 _FARTHEST = 1e18
 """Ticks beyond this are impossible in any unit, and are read as this limit."""
-
-
-def _header_tick(timing: PointTiming, low: float, high: float) -> float:
-    """Return what makes relative ticks of a message count from its header stamp, ticks."""
-    zero = min(low, 0)
-    if timing.anchor == "end":
-        return -float(max(high, 0) if zero < 0 else high)
-    return -float(zero) if timing.anchor == "start" else 0.0
 
 
 class Order(Protocol):

@@ -101,20 +101,40 @@ class PointTiming:
         tick = self.tick_ns * 1e-9
         # Relative times from zero keep their zero: the first firings may have no return.
         zero = low if self.absolute else min(low, 0)
-        last = high
-        if self.anchor == "end" and zero < 0 and not self.absolute:
-            last = max(high, 0)
-        duration = float((last - zero) * tick)
+        duration = float((self._last_tick(low, high) - zero) * tick)
         # Subtract in the ticks' own type: only the difference fits into a float32.
         since = (time - time.dtype.type(zero)) * tick
-        start_ns = header_ns
+        times = np.clip(since.astype(np.float32), 0.0, np.float32(duration))
+        return self.at_ns(header_ns, zero, low, high), times, duration
+
+    def at_ns(self, header_ns: int, tick: float | int, low: float | int, high: float | int) -> int:
+        """Return when a tick of a scan was, ns.
+
+        Args:
+            header_ns: header stamp of the message, ns.
+            tick: what is asked for.
+            low, high: smallest and largest tick of the scan.
+        """
         if self.anchor == "points":
-            start_ns = ticks_to_ns(low, self.tick_ns)
-        elif self.anchor == "end":
-            start_ns = header_ns - round(duration * 1e9)
-        elif self.anchor == "inside":
-            start_ns = header_ns + round(zero * self.tick_ns)
-        return start_ns, np.clip(since.astype(np.float32), 0.0, np.float32(duration)), duration
+            return ticks_to_ns(tick, self.tick_ns)
+        return header_ns + round((tick - self.header_tick(low, high)) * self.tick_ns)
+
+    def header_tick(self, low: float | int, high: float | int) -> float | int:
+        """Return the tick at which the header stamp of a scan lies, where it places the scan.
+
+        Args:
+            low, high: smallest and largest tick of the scan.
+        """
+        if self.anchor == "end":
+            return self._last_tick(low, high)
+        if self.anchor == "inside":
+            return 0
+        return low if self.absolute else min(low, 0)
+
+    def _last_tick(self, low: float | int, high: float | int) -> float | int:
+        """Return where a scan ends: times below zero that count from its end may lack their last firings."""
+        counts_down = self.anchor == "end" and low < 0 and not self.absolute
+        return max(high, 0) if counts_down else high
 
 
 def scan_period(header_ns: Sequence[int], fallback: float) -> float:

@@ -1,16 +1,16 @@
 """What is tuned or trained: recordings, the parameters as a vector with its bounds, and their loss."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lio_jax.core.errors import UsageError
+from lio_jax.core.errors import LioJaxError, UsageError
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.run.fitted_settings import ring_count
@@ -40,6 +40,8 @@ _REACH = {
 logarithm."""
 SHORTEST_SEGMENT = 20
 """Least number of scans of a segment: a shorter one shows the start only."""
+
+Held = TypeVar("Held")
 
 
 @dataclass(frozen=True)
@@ -117,25 +119,35 @@ def identity(problem: Problem) -> dict[str, Any]:
     }
 
 
-def refuse_another(path: Path, kind: str, held: Mapping[str, Any], own: Mapping[str, Any]) -> None:
-    """Refuse to continue from a file that another problem has left.
+def taken_up(
+    path: Path, kind: str, own: Mapping[str, Any], read: Callable[[Path], tuple[Mapping[str, Any], Held]]
+) -> Held:
+    """Return what an interrupted tuning or training has left in a file.
 
     Args:
         path: of the file.
-        kind: what it holds, such as ``a training``.
-        held: the identity in the file.
-        own: that of the problem which would go on.
+        kind: what it holds, such as ``training``.
+        own: the identity of the problem which goes on.
+        read: gives the identity in a file, and the rest of it.
 
     Raises:
-        UsageError: they differ. It names what differs.
+        UsageError: another problem has left it. The message names what differs.
+        LioJaxError: it cannot be read, or lacks a part.
     """
-    other = [name for name, value in own.items() if held[name] != value]
+    try:
+        identified, held = read(path)
+        other = [name for name, value in own.items() if identified[name] != value]
+        was = f" (it has {identified['objective']})" if "objective" in other else ""
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise LioJaxError(
+            f"{path}: is no {kind} that can be continued ({error}); give --overwrite to begin anew."
+        ) from None
     if other:
-        was = f" (it has {held['objective']})" if "objective" in other else ""
         raise UsageError(
-            f"{path}: is {kind} with other {', '.join(other)}{was}; give another --out, or --overwrite to "
-            "begin anew."
+            f"{path}: is the {kind} of another problem, with other {', '.join(other)}{was}; give another "
+            "--out, or --overwrite to begin anew."
         )
+    return held
 
 
 def problem_of(

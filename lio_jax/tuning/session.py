@@ -17,7 +17,7 @@ from lio_jax.core.files import atomic_path
 from lio_jax.tuning.evaluated import Evaluated, validation_loss
 from lio_jax.tuning.objectives import nothing_counts, nothing_depends
 from lio_jax.tuning.optimise import Bounds, adam, fisher_scoring, lbfgsb, parameter_covariance, stationary
-from lio_jax.tuning.problem import Problem, identity, refuse_another
+from lio_jax.tuning.problem import Problem, identity, taken_up
 from lio_jax.tuning.recording import Recording
 
 HISTORY = "history.json"
@@ -80,7 +80,7 @@ class Session:
         self._unit: NDArray[np.float64] | None = None
         self.history: list[Iterate] = []
         if self._path is not None and self._path.exists():
-            self.history = _read(self._path, problem)
+            self.history = taken_up(self._path, "history", identity(problem), _read)
 
     @property
     def best(self) -> Iterate:
@@ -180,18 +180,10 @@ class Session:
             aside.write_text(json.dumps(held, indent=1) + "\n")
 
 
-def _read(path: Path, problem: Problem) -> list[Iterate]:
-    try:
-        held = json.loads(path.read_text())
-        refuse_another(path, "the history of a tuning", held["identity"], identity(problem))
-        iterates = []
-        for one in held["iterates"]:
-            row: dict[str, Any] = {
-                key: tuple(value) if isinstance(value, list) else value for key, value in one.items()
-            }
-            iterates.append(Iterate(**row))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise LioJaxError(
-            f"{path}: is no history that can be continued ({error}); give --overwrite to begin anew."
-        ) from None
-    return iterates
+def _read(path: Path) -> tuple[dict[str, Any], list[Iterate]]:
+    held = json.loads(path.read_text())
+    rows: list[dict[str, Any]] = [
+        {key: tuple(value) if isinstance(value, list) else value for key, value in one.items()}
+        for one in held["iterates"]
+    ]
+    return held["identity"], [Iterate(**row) for row in rows]

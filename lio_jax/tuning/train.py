@@ -25,7 +25,7 @@ from lio_jax.settings.settings import Settings
 from lio_jax.tuning.evaluated import validation_loss
 from lio_jax.tuning.objectives import Objective, nothing_depends
 from lio_jax.tuning.optimise import Bounds, Moments
-from lio_jax.tuning.problem import Problem, identity, problem_of, refuse_another
+from lio_jax.tuning.problem import Problem, identity, problem_of, taken_up
 
 TRAINING = "training.npz"
 _Vector = NDArray[np.float64]
@@ -126,6 +126,9 @@ def train(
     session = TrainingSession(problem, schedule or Schedule(), out)
     session.run(observer)
     return session.trained()
+
+
+_Held = tuple[NDArray[np.float64], NDArray[np.float64], Moments, list[float], int, list[Epoch]]
 
 
 class TrainingSession:
@@ -234,18 +237,16 @@ class TrainingSession:
             )
 
     def _take_up(self, path: Path) -> None:
-        try:
-            held = read_arrays(path)
-            refuse_another(path, "a training", json.loads(str(held["identity"])), self._identity())
-        except (OSError, ValueError, KeyError) as error:
-            raise LioJaxError(
-                f"{path}: is no training that can be continued ({error}); give --overwrite to begin anew."
-            ) from None
-        self._x, self._best_x = held["x"], held["best_x"]
-        self._moments = Moments(held["mean"], held["square"], int(held["steps"]))
-        self._losses, self._skipped = held["losses"].tolist(), int(held["skipped"])
+        held = taken_up(path, "training", self._identity(), self._read)
+        self._x, self._best_x, self._moments, self._losses, self._skipped, self.epochs = held
+
+    def _read(self, path: Path) -> tuple[dict[str, Any], _Held]:
+        held = read_arrays(path)
         judged = bool(self._problem.validation)
-        self.epochs = [
+        epochs = [
             Epoch(training, validation if judged else None, int(skipped))
             for training, validation, skipped in held["epochs"].tolist()
         ]
+        moments = Moments(held["mean"], held["square"], int(held["steps"]))
+        progress = (held["x"], held["best_x"], moments, held["losses"].tolist(), int(held["skipped"]), epochs)
+        return json.loads(str(held["identity"])), progress

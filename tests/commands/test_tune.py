@@ -88,7 +88,7 @@ def test_a_tuning_leaves_settings_history_and_a_picture(recordings, tmp_path, ca
     assert len(json.loads((out / "history.json").read_text())["iterates"]) == 4
 
     assert main([*words, "--iterations", "4", "--objective", "ate"]) == 2
-    assert "history of a tuning with other objective (it has pose+ranges)" in capsys.readouterr().err
+    assert "history of another problem, with other objective (it has pose+ranges)" in capsys.readouterr().err
 
 
 def test_tune_from_python_is_that_of_the_command(recordings, tmp_path):

@@ -265,7 +265,7 @@ def test_a_killed_tuning_goes_on_from_its_last_iterate(tmp_path):
 def test_the_history_of_another_tuning_is_refused(tmp_path, changed, named):
     session(tmp_path).run("scoring", BEST + 1.5, WIDE, 1, 0)
     with pytest.raises(
-        UsageError, match=rf"{HISTORY}: is the history of a tuning with other {named}; .*--overwrite"
+        UsageError, match=rf"{HISTORY}: is the history of another problem, with other {named}; .*--overwrite"
     ):
         Session(problem(lambda x, recordings: noise_likelihood(x), **changed), tmp_path, 50)
 

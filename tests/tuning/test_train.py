@@ -162,7 +162,10 @@ def own_loss(observed, truth):
 def test_another_training_is_not_continued(tmp_path, changed, seed, named):
     short = replace(SCHEDULE, epochs=1)
     trained(problem(), short, tmp_path)
-    with pytest.raises(UsageError, match=rf"{TRAINING}: is a training with other {named}; .*--overwrite"):
+    with pytest.raises(
+        UsageError,
+        match=rf"{TRAINING}: is the training of another problem, with other {named}; .*--overwrite",
+    ):
         trained(problem(**changed), replace(short, seed=seed), tmp_path)
 
 
@@ -176,10 +179,30 @@ def test_an_objective_of_ones_own_is_told_from_others_in_any_process():
     assert as_named("noise").name == as_named("pose + ranges").name == "pose+ranges"
 
 
-def test_a_damaged_training_is_named(tmp_path):
-    (tmp_path / TRAINING).write_bytes(b"PK\x03\x04 and no more")
+def without(member):
+    def damage(path):
+        with np.load(path) as held:
+            kept = {name: held[name] for name in held.files if name != member}
+        with path.open("wb") as file:
+            np.savez(file, **kept)
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: path.write_bytes(b"PK\x03\x04 and no more"),
+        without("identity"),
+        without("best_x"),
+        without("epochs"),
+    ],
+)
+def test_a_damaged_training_is_named(tmp_path, damage):
+    trained(problem(), replace(SCHEDULE, epochs=1), tmp_path)
+    damage(tmp_path / TRAINING)
     with pytest.raises(LioJaxError, match=rf"{TRAINING}: is no training that can be continued"):
-        trained(problem(), out=tmp_path)
+        trained(problem(), replace(SCHEDULE, epochs=1), tmp_path)
 
 
 @pytest.mark.parametrize("wrong", [{"batch": 0}, {"epochs": 0}, {"patience": 0}, {"rate": float("nan")}])
