@@ -27,6 +27,8 @@ _MOST_DAMPING = 1e8
 """Damping at which the search ends without convergence."""
 _WORTH = 10.0
 """Factor by which the damping changes after each step."""
+_LONGEST = 2.0
+"""Largest share of a step that is taken, and the inverse of the smallest."""
 
 
 class Smoothed(eqx.Module):
@@ -62,6 +64,17 @@ class Smoothed(eqx.Module):
         return jnp.block([[inverse.chain.diagonal[row], across], [across.T, inverse.corner]])
 
 
+class _Step(NamedTuple):
+    """A step without damping, for comparison with the next one."""
+
+    of_states: Float[Array, "n 15"]
+    of_tilt: Float[Array, " q"]
+    square: Float[Array, ""]
+    """Its squared length, in squared standard deviations; inf: there is no such step."""
+    share: Float[Array, ""]
+    """The share of it that was taken."""
+
+
 class _Loop(NamedTuple):
     trial: tuple[MotionState, Array]
     """The states and the tilt after the last step, whose cost is not known yet."""
@@ -71,6 +84,8 @@ class _Loop(NamedTuple):
     """Normal equations at ``best``."""
     damping: Float[Array, ""]
     decrement: Float[Array, ""]
+    last: _Step
+    """The step from ``best`` to ``trial``."""
     iterations: Int32[Array, ""]
     done: Bool[Array, ""]
 
@@ -145,14 +160,16 @@ def _solve(inputs: Any) -> ImplicitSolution:
         )
         factor = factorise_bordered(_damped(normal.matrix, damping))
         step, turn = solve_bordered(factor, -normal.gradient, -normal.by_tilt)
-        gained = jnp.sum(step * normal.gradient) + jnp.sum(turn * normal.by_tilt)
-        decrement = jnp.sqrt(jnp.abs(gained))
+        square = jnp.abs(_along(normal, step, turn))
+        decrement = jnp.sqrt(square)
+        share = jnp.where(pays & (damping == 0), _share(loop.last, normal), 1.0)
         return _Loop(
-            trial=(states.retract(step), tilt + turn),
+            trial=(states.retract(share * step), tilt + share * turn),
             best=(states, tilt),
             normal=normal,
             damping=damping,
             decrement=decrement,
+            last=_Step(step, turn, jnp.where(damping == 0, square, jnp.inf), share),
             iterations=loop.iterations + 1,
             done=(damping == 0) & (decrement <= tolerance),
         )
@@ -164,11 +181,30 @@ def _solve(inputs: Any) -> ImplicitSolution:
         lambda leaf: jnp.full(leaf.shape, jnp.inf, leaf.dtype), jax.eval_shape(normal_at, guess)
     )
     zero = jnp.zeros((), blank.cost.dtype)
-    start = _Loop(guess, guess, blank, zero, zero, jnp.int32(0), jnp.array(False))
+    no_step = _Step(jnp.zeros_like(blank.gradient), jnp.zeros_like(blank.by_tilt), zero + jnp.inf, zero + 1)
+    start = _Loop(guess, guess, blank, zero, zero, no_step, jnp.int32(0), jnp.array(False))
     loop = jax.lax.while_loop(unfinished, iterate, start)
     root = jnp.zeros(blank.gradient.size + blank.by_tilt.size, blank.gradient.dtype)
     kept = _Found(*loop.best, loop.decrement, loop.iterations, loop.done)
     return ImplicitSolution(root, kept, (*loop.best, loop.normal))
+
+
+def _along(normal: Normal, of_states: Array, of_tilt: Array) -> Array:
+    """Return the slope of the cost along a step."""
+    return jnp.sum(of_states * normal.gradient) + jnp.sum(of_tilt * normal.by_tilt)
+
+
+def _share(last: _Step, normal: Normal) -> Array:
+    """Return the share of the next step that leads to the minimum along the last one.
+
+    The cost's second derivative along a step is ``curvature`` times that of Gauss-Newton, which leaves out
+    the curvature of large residuals. It shows in the slope that remains after the step (Barzilai & Borwein
+    1988). Where one weak direction holds most of the error, as those of an accelerometer bias and of gravity
+    do, full steps would come nearer to the minimum only by a constant factor each.
+    """
+    remaining = -_along(normal, last.of_states, last.of_tilt) / last.square
+    curvature = (1 - remaining) / last.share
+    return 1 / jnp.clip(curvature, 1 / _LONGEST, _LONGEST)
 
 
 def _damped(matrix: Bordered, damping: Array) -> Bordered:

@@ -210,17 +210,11 @@ def _table(before: Keyframes, after: Keyframes, clock: Clock) -> KeyframeTable:
     )
 
 
-_SMALL_STEP = 0.1
-"""Length of the smoother's next step, standard deviations, up to which a bounded number of iterations is
-enough: the estimate would hardly change."""
-
-
 def _output(
     nav: NavState, clock: Clock, features: Features, match: MapMatch, smoothing: Smoothing, added: Addition
 ) -> Output:
     found, smoothed, placed, frames = match.registration, smoothing.smoothed, added.placed, added.frames
-    unfinished = (smoothed.status != CONVERGED) & ~(smoothed.decrement <= _SMALL_STEP)
-    unfinished &= (found.status == CONVERGED) & ~clock.first
+    unfinished = (smoothed.status != CONVERGED) & (found.status == CONVERGED) & ~clock.first
     offset = (frames.corner.origin - frames.surface.origin).astype(placed.corner.dtype)
     corners, surfaces = len(placed.corner), len(placed.surface)
     return Output(
