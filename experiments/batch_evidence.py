@@ -27,8 +27,8 @@ from lio_jax.estimation.pose_logarithm import log_and_jacobian
 from lio_jax.imu.discretise import discretise, process_noise
 from lio_jax.imu.params import ImuParams
 from lio_jax.imu.preintegration import NAV_DOF, accumulate, nav_transition, sensitivity
+from lio_jax.imu.sample_effects import LAG_DOF, lag_of_inputs, still_to_show
 from lio_jax.imu.sampling import Intervals
-from lio_jax.imu.strapdown import LAG_DOF, lag_of_inputs, still_to_show
 
 WORLD_SIGMA = jnp.repeat(jnp.array([0.02, 0.001]), 3)
 """Prior standard deviations of the world's attitude and position relative to gravity's world, rad and m."""

@@ -9,7 +9,8 @@ import pytest
 
 from lio_jax.core.error_state import DOF, LAG, POSITION, ROTATION, NavEstimate, retract
 from lio_jax.imu.path import pose_at
-from lio_jax.imu.strapdown import path_along, propagate_sweep, still_to_show
+from lio_jax.imu.sample_effects import still_to_show
+from lio_jax.imu.strapdown import path_along, propagate_sweep
 from tests.imu.motion import ideal_imu, nav_at, quick_jit
 from tests.params import default_params
 
