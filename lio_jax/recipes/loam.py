@@ -165,6 +165,10 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
         "params.map.corner_voxel_size": 0.1,
     }
 
+    @property
+    def compensates(self) -> bool:
+        return self.config.loam.compensate
+
     def init(self, params: LoamParams, imu: ImuBatch | None = None) -> LoamState:
         """Return the state before the first scan: at the world's origin, with an empty map.
 

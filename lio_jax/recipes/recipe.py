@@ -305,6 +305,11 @@ class Recipe(ABC, Generic[C, P, S]):
     given_values: ClassVar[Mapping[str, Any]] = {}
     """Values by path in which the recipe differs from the defaults of the back end and of the runner."""
 
+    @property
+    def compensates(self) -> bool:
+        """Return whether the motion within a sweep is compensated."""
+        return self.needs.point_times
+
     @abstractmethod
     def init(self, params: P, imu: ImuBatch | None = None) -> S:
         """Return the state before the first scan: at the world's origin, with an empty map.

@@ -1,0 +1,171 @@
+"""Write the registered clouds of a run: each scan's compensated points in world, as its pose was found.
+
+FAST-LIO2 publishes them as /cloud_registered and saves them under pcd_save. The poses are those of the
+odometry at the scan's own time: a correction of the back end that comes later does not move a file.
+"""
+
+import re
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.files import aside_of
+from lio_jax.core.xla import programs
+from lio_jax.recipes.whole_scan import placed_scan
+from lio_jax.run.map_file import XYZ, write_cloud
+from lio_jax.run.sinks import RunResult, Sink
+from lio_jax.run.track import ScanResult
+from lio_jax.settings.settings import Settings, recipe_of
+
+FOLDER = "clouds"
+_OURS = re.compile(r"(\d{6,}|\.\d{6,}\.[0-9a-f]{8})\.pcd")
+_SPOOL = re.compile(r"\.\d{6,}\.[0-9a-f]{8}\.pcd")
+_WAITING = 4
+"""Number of scans that may wait to be written; beyond that the run waits."""
+_AT_ONCE = 1 << 18
+"""Number of points that are copied at once from the file in which they are collected."""
+
+
+class ScanClouds(Sink):
+    """Writes clouds/NNNNNN.pcd: the points of the scans from number NNNNNN of the recording on."""
+
+    def __init__(self, folder: Path, settings: Settings, start: int = 0) -> None:
+        """Begin a folder of clouds; a thread places and writes the points.
+
+        Args:
+            folder: of the run.
+            settings: of the run; ``config.output.clouds`` is not "none".
+            start: number of the first scan in the recording.
+        """
+        self._folder, self._start = folder / FOLDER, start
+        self._folder.mkdir(exist_ok=True)
+        output = settings.run.output
+        self._all, self._interval = output.clouds == "all", output.clouds_interval
+        self._params = settings.params()
+        self._place = programs(placed_scan, recipe_of(settings).compensates)
+        self._last: ScanResult | None = None
+        self._file: _OneFile | None = None
+        self._fields = XYZ
+        self._files = self._points = 0
+        self._writer = ThreadPoolExecutor(1, "clouds")
+        self._pending: deque[Future[None]] = deque()
+
+    def take(self, result: ScanResult) -> None:
+        """Hand a scan to the writing thread; an error of that thread ends the run here."""
+        while self._pending and (len(self._pending) >= _WAITING or self._pending[0].done()):
+            self._pending.popleft().result()
+        self._pending.append(self._writer.submit(self._add, result, self._last))
+        # a scan before the first one that can begin a map has no pose
+        if self._last is not None or (result.fed is not None and result.fed.usable):
+            self._last = result
+
+    def finish(self, run: RunResult) -> None:
+        """Complete the last file, and say how many there are."""
+        while self._pending:
+            self._pending.popleft().result()
+        self._writer.submit(self._complete).result()
+        run.metrics["clouds"] = {"files": self._files, "points": self._points}
+
+    def close(self) -> None:
+        """End the thread; a file that was not completed leaves nothing."""
+        self._writer.shutdown(cancel_futures=True)
+        if self._file is not None:
+            self._file.close()
+        with suppress(OSError):  # the folder holds clouds
+            self._folder.rmdir()
+
+    def _add(self, result: ScanResult, last: ScanResult | None) -> None:
+        if self._file is not None and result.index >= self._file.end:
+            self._complete()
+        rows = self._rows(result, last)
+        if not len(rows):
+            return
+        if self._file is None:
+            first = result.index - result.index % self._interval if self._interval else 0
+            end = first + self._interval if self._interval else np.inf
+            self._file = _OneFile(self._folder / f"{self._start + first:06d}.pcd", end, self._fields)
+        self._file.append(rows)
+
+    def _complete(self) -> None:
+        if self._file is not None:
+            file, self._file = self._file, None
+            try:
+                file.write()
+            finally:
+                file.close()
+            self._files += 1
+            self._points += file.count
+
+    def _rows(self, result: ScanResult, last: ScanResult | None) -> NDArray[np.float32]:
+        """Return the points of a scan, a column for each field, m in world."""
+        fed = result.fed
+        assert fed is not None
+        if not (fed.usable and np.isfinite(result.T_world_imu).all()):
+            return np.zeros((0, len(self._fields)), np.float32)
+        if not self._all:
+            output = result.output
+            points = np.asarray(output.points)[np.asarray(output.points_mask)]
+            return (points + np.asarray(output.origin)).astype(np.float32)
+        T_matched = result.output.registration.T_world_lidar
+        before = result.nav if last is None else last.nav
+        points, mask = self._place(
+            self._params, before, result.nav, T_matched, jnp.array(last is None), fed.scan, fed.imu
+        )
+        kept, intensity = np.asarray(mask), np.asarray(fed.scan.intensity)
+        if not self._points and self._file is None:
+            self._fields = (*XYZ, "intensity") if intensity[kept].any() else XYZ
+        columns = [np.asarray(points)[kept], intensity[kept, None]][: len(self._fields) - 2]
+        return np.concatenate(columns, axis=1, dtype=np.float32)
+
+
+class _OneFile:
+    """Collects points beside a PCD until their number is known, which a PCD states first."""
+
+    def __init__(self, path: Path, end: float, fields: tuple[str, ...]) -> None:
+        self._path, self.end, self._fields = path, end, fields
+        self._aside = aside_of(path)
+        self._spool: BinaryIO = self._aside.open("w+b")
+        self.count = 0
+
+    def append(self, rows: NDArray[np.float32]) -> None:
+        self._spool.write(np.ascontiguousarray(rows, "<f4").tobytes())
+        self.count += len(rows)
+
+    def write(self) -> None:
+        self._spool.seek(0)
+        write_cloud(self._path, self._collected(), self.count, self._fields)
+
+    def close(self) -> None:
+        with suppress(OSError):  # a full disk, met before: what is in the buffer is given up
+            self._spool.close()
+        self._aside.unlink(missing_ok=True)
+
+    def _collected(self) -> Iterator[NDArray[np.float32]]:
+        columns = len(self._fields)
+        while values := self._spool.read(4 * columns * _AT_ONCE):
+            yield np.frombuffer(values, "<f4").reshape(-1, columns)
+
+
+def remove_clouds(run_folder: Path, unfinished_only: bool = False) -> None:
+    """Remove the clouds of an earlier run, and nothing else.
+
+    Args:
+        run_folder: folder of the run.
+        unfinished_only: remove only what a killed run had not completed.
+    """
+    folder = run_folder / FOLDER
+    if not folder.is_dir() or folder.is_symlink():
+        return
+    ours = _SPOOL if unfinished_only else _OURS
+    for entry in folder.iterdir():
+        if ours.fullmatch(entry.name):
+            entry.unlink()
+    with suppress(OSError):  # the folder holds completed clouds, or files of others
+        folder.rmdir()
