@@ -4,6 +4,7 @@ A recipe compensates only the points that it matches or adds to the map. This co
 same way, after the step and apart from its program.
 """
 
+import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Float32
@@ -16,13 +17,23 @@ from lio_jax.lidar.deskew import deskew_constant_velocity, twist_without_turn
 from lio_jax.recipes.params import RecipeParams
 
 
+class Leg(eqx.Module):
+    """The states between which the motion within a sweep is known: those at its own end and at one before."""
+
+    start: NavState
+    end: NavState
+    interval: Float[Array, ""]
+    """Time between the two, s; 0 where only one scan has a pose."""
+    first: Bool[Array, ""]
+    """The sweep ends at ``start`` instead: no scan before it had a pose, and the next one shows the turn."""
+
+
 def placed_scan(
     compensates: bool,
     params: RecipeParams,
-    last: NavState,
     nav: NavState,
     T_matched: jaxlie.SE3,
-    first: Bool[Array, ""],
+    leg: Leg,
     scan: Scan,
     imu: ImuBatch | None,
 ) -> tuple[Float32[Array, "n 3"], Bool[Array, " n"]]:
@@ -35,10 +46,9 @@ def placed_scan(
     Args:
         compensates: whether the motion within the sweep is compensated; static.
         params: of the recipe, for the range limits and the corrections of the points.
-        last: state at the last scan's end; for the first scan the same as ``nav``.
         nav: state at the scan's end.
         T_matched: T_world_lidar of the scan match, where points without compensation lie.
-        first: no scan before this one had a pose.
+        leg: from the last scan to this one.
         scan: padded sweep, its coordinates as they were recorded.
         imu: samples that cover the scan; None: there are none.
     """
@@ -47,7 +57,7 @@ def placed_scan(
     mask = scan.mask & (squared_range > near**2) & (squared_range < far**2)
     points = params.lidar.corrected(jnp.where(mask[:, None], scan.points, 0.0), scan.ring)
     if compensates:
-        points = _at_the_end(points, last, nav, first, scan, imu)
+        points = _at_the_end(points, nav, leg, scan, imu)
     T_world_lidar = nav.T_world_imu @ nav.T_imu_lidar if compensates else T_matched
     turned = points @ rotation_matrix(T_world_lidar.rotation()).astype(points.dtype).T
     world = turned.astype(nav.velocity.dtype) + T_world_lidar.translation()
@@ -55,24 +65,17 @@ def placed_scan(
 
 
 def _at_the_end(
-    points: Float[Array, "n 3"],
-    last: NavState,
-    nav: NavState,
-    first: Bool[Array, ""],
-    scan: Scan,
-    imu: ImuBatch | None,
+    points: Float[Array, "n 3"], nav: NavState, leg: Leg, scan: Scan, imu: ImuBatch | None
 ) -> Float[Array, "n 3"]:
     """Return points in the lidar frame of the scan's end, m; arguments as of :func:`placed_scan`."""
     dtype = nav.velocity.dtype
-    end, interval = scan.duration.astype(dtype), scan.interval.astype(dtype)
+    end, interval = scan.duration.astype(dtype), leg.interval.astype(dtype)
     if imu is not None:
-        path = path_along(last, imu, jnp.where(first, 0.0, end - interval), end)
+        path = path_along(leg.start, imu, jnp.where(leg.first, 0.0, end - interval), end)
         return deskew_along(path, nav.T_imu_lidar, points, scan.time)
-    known = ~first & (interval > 0)
-    T_last_lidar = (last.T_world_imu @ last.T_imu_lidar).inverse() @ nav.T_world_imu @ nav.T_imu_lidar
-    # a first scan shows no turn
+    T_start, T_end = (one.T_world_imu @ one.T_imu_lidar for one in (leg.start, leg.end))
+    known = interval > 0
+    turned = jaxlie.SE3((T_start.inverse() @ T_end).wxyz_xyz).log() / jnp.where(known, interval, 1.0)
     straight = twist_without_turn(nav.T_world_imu.rotation().inverse() @ nav.velocity, nav.T_imu_lidar)
-    twist = jnp.where(
-        known, jaxlie.SE3(T_last_lidar.wxyz_xyz).log() / jnp.where(known, interval, 1.0), straight
-    )
+    twist = jnp.where(known, turned, straight)
     return deskew_constant_velocity(points, scan.time - scan.duration, twist)

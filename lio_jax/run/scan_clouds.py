@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lio_jax.core.files import aside_of
 from lio_jax.core.xla import programs
-from lio_jax.recipes.whole_scan import placed_scan
+from lio_jax.recipes.whole_scan import Leg, placed_scan
 from lio_jax.run.map_file import XYZ, write_cloud
 from lio_jax.run.sinks import RunResult, Sink
 from lio_jax.run.track import ScanResult
@@ -51,6 +51,7 @@ class ScanClouds(Sink):
         self._params = settings.params()
         self._place = programs(placed_scan, recipe_of(settings).compensates)
         self._last: ScanResult | None = None
+        self._opening: ScanResult | None = None
         self._file: _OneFile | None = None
         self._fields = XYZ
         self._files = self._points = 0
@@ -59,15 +60,21 @@ class ScanClouds(Sink):
 
     def take(self, result: ScanResult) -> None:
         """Hand a scan to the writing thread; an error of that thread ends the run here."""
-        while self._pending and (len(self._pending) >= _WAITING or self._pending[0].done()):
-            self._pending.popleft().result()
-        self._pending.append(self._writer.submit(self._add, result, self._last))
+        fed = result.fed
+        assert fed is not None
         # a scan before the first one that can begin a map has no pose
-        if self._last is not None or (result.fed is not None and result.fed.usable):
-            self._last = result
+        if not fed.usable:
+            return
+        if self._last is None:
+            self._opening = result
+        else:
+            self._open(result)
+            self._submit(result, self._last, result)
+        self._last = result
 
     def finish(self, run: RunResult) -> None:
         """Complete the last file, and say how many there are."""
+        self._open(None)
         while self._pending:
             self._pending.popleft().result()
         self._writer.submit(self._complete).result()
@@ -81,10 +88,21 @@ class ScanClouds(Sink):
         with suppress(OSError):  # the folder holds clouds
             self._folder.rmdir()
 
-    def _add(self, result: ScanResult, last: ScanResult | None) -> None:
+    def _open(self, second: ScanResult | None) -> None:
+        """Submit the first scan: only the second one shows how it turned."""
+        if self._opening is not None:
+            opening, self._opening = self._opening, None
+            self._submit(opening, opening, second or opening)
+
+    def _submit(self, result: ScanResult, start: ScanResult, end: ScanResult) -> None:
+        while self._pending and (len(self._pending) >= _WAITING or self._pending[0].done()):
+            self._pending.popleft().result()
+        self._pending.append(self._writer.submit(self._add, result, start, end))
+
+    def _add(self, result: ScanResult, start: ScanResult, end: ScanResult) -> None:
         if self._file is not None and result.index >= self._file.end:
             self._complete()
-        rows = self._rows(result, last)
+        rows = self._rows(result, start, end)
         if not len(rows):
             return
         if self._file is None:
@@ -103,21 +121,18 @@ class ScanClouds(Sink):
             self._files += 1
             self._points += file.count
 
-    def _rows(self, result: ScanResult, last: ScanResult | None) -> NDArray[np.float32]:
+    def _rows(self, result: ScanResult, start: ScanResult, end: ScanResult) -> NDArray[np.float32]:
         """Return the points of a scan, a column for each field, m in world."""
-        fed = result.fed
-        assert fed is not None
-        if not (fed.usable and np.isfinite(result.T_world_imu).all()):
+        output, fed = result.output, result.fed
+        if not np.isfinite(result.T_world_imu).all() or fed is None:
             return np.zeros((0, len(self._fields)), np.float32)
         if not self._all:
-            output = result.output
             points = np.asarray(output.points)[np.asarray(output.points_mask)]
             return (points + np.asarray(output.origin)).astype(np.float32)
-        T_matched = result.output.registration.T_world_lidar
-        before = result.nav if last is None else last.nav
-        points, mask = self._place(
-            self._params, before, result.nav, T_matched, jnp.array(last is None), fed.scan, fed.imu
-        )
+        interval = np.float32((end.stamp_ns - start.stamp_ns) * 1e-9)
+        leg = Leg(start.nav, end.nav, jnp.array(interval), jnp.array(result is start))
+        T_matched = output.registration.T_world_lidar
+        points, mask = self._place(self._params, result.nav, T_matched, leg, fed.scan, fed.imu)
         kept, intensity = np.asarray(mask), np.asarray(fed.scan.intensity)
         if not self._points and self._file is None:
             self._fields = (*XYZ, "intensity") if intensity[kept].any() else XYZ
