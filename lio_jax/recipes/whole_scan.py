@@ -13,7 +13,7 @@ from lio_jax.core.geometry import dot3, rotation_matrix
 from lio_jax.core.types import ImuBatch, NavState, Scan
 from lio_jax.imu.path import deskew_along
 from lio_jax.imu.strapdown import path_along
-from lio_jax.lidar.deskew import deskew_constant_velocity, twist_without_turn
+from lio_jax.lidar.deskew import deskew_constant_velocity
 from lio_jax.recipes.params import RecipeParams
 
 
@@ -41,7 +41,7 @@ def placed_scan(
 
     With inertial samples, the motion within the sweep is that from the last scan's state along the samples,
     seen from the sweep's end, and the end lies at the scan's own pose: FAST-LIO2's backward propagation.
-    Without samples, the motion is the constant twist from the last scan's pose to this one's.
+    Without samples, the velocity is that of the state and the angular rate the mean one since the last scan.
 
     Args:
         compensates: whether the motion within the sweep is compensated; static.
@@ -73,9 +73,9 @@ def _at_the_end(
     if imu is not None:
         path = path_along(leg.start, imu, jnp.where(leg.first, 0.0, end - interval), end)
         return deskew_along(path, nav.T_imu_lidar, points, scan.time)
-    T_start, T_end = (one.T_world_imu @ one.T_imu_lidar for one in (leg.start, leg.end))
     known = interval > 0
-    turned = jaxlie.SE3((T_start.inverse() @ T_end).wxyz_xyz).log() / jnp.where(known, interval, 1.0)
-    straight = twist_without_turn(nav.T_world_imu.rotation().inverse() @ nav.velocity, nav.T_imu_lidar)
-    twist = jnp.where(known, turned, straight)
+    turn = (leg.start.T_world_imu.rotation().inverse() @ leg.end.T_world_imu.rotation()).log()
+    rate = jnp.where(known, turn / jnp.where(known, interval, 1.0), 0.0)
+    velocity = nav.T_world_imu.rotation().inverse() @ nav.velocity
+    twist = nav.T_imu_lidar.inverse().adjoint() @ jnp.concatenate([velocity, rate])
     return deskew_constant_velocity(points, scan.time - scan.duration, twist)

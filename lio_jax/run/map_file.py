@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,10 +75,11 @@ def _append(file: BinaryIO, points: NDArray[np.float32]) -> int:
 def _pcd_header(count: int, fields: tuple[str, ...]) -> bytes:
     from pypcd4 import Encoding, MetaData
 
+    floats: tuple[Literal["F"], ...] = ("F",) * len(fields)
     described = MetaData(
         fields=fields,
         size=(4,) * len(fields),
-        type=("F",) * len(fields),
+        type=floats,
         count=(1,) * len(fields),
         points=count,
         width=count,

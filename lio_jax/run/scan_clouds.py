@@ -4,6 +4,7 @@ FAST-LIO2 publishes them as /cloud_registered and saves them under pcd_save. The
 odometry at the scan's own time: a correction of the back end that comes later does not move a file.
 """
 
+import math
 import re
 from collections import deque
 from collections.abc import Iterator
@@ -53,7 +54,7 @@ class ScanClouds(Sink):
         self._last: ScanResult | None = None
         self._opening: ScanResult | None = None
         self._file: _OneFile | None = None
-        self._fields = XYZ
+        self._fields: tuple[str, ...] = XYZ
         self._files = self._points = 0
         self._writer = ThreadPoolExecutor(1, "clouds")
         self._pending: deque[Future[None]] = deque()
@@ -100,15 +101,15 @@ class ScanClouds(Sink):
         self._pending.append(self._writer.submit(self._add, result, start, end))
 
     def _add(self, result: ScanResult, start: ScanResult, end: ScanResult) -> None:
-        if self._file is not None and result.index >= self._file.end:
+        if self._file is not None and result.index >= self._file.beyond:
             self._complete()
         rows = self._rows(result, start, end)
         if not len(rows):
             return
         if self._file is None:
             first = result.index - result.index % self._interval if self._interval else 0
-            end = first + self._interval if self._interval else np.inf
-            self._file = _OneFile(self._folder / f"{self._start + first:06d}.pcd", end, self._fields)
+            beyond = first + self._interval if self._interval else math.inf
+            self._file = _OneFile(self._folder / f"{self._start + first:06d}.pcd", beyond, self._fields)
         self._file.append(rows)
 
     def _complete(self) -> None:
@@ -143,8 +144,9 @@ class ScanClouds(Sink):
 class _OneFile:
     """Collects points beside a PCD until their number is known, which a PCD states first."""
 
-    def __init__(self, path: Path, end: float, fields: tuple[str, ...]) -> None:
-        self._path, self.end, self._fields = path, end, fields
+    def __init__(self, path: Path, beyond: float, fields: tuple[str, ...]) -> None:
+        """Begin a file that takes the scans before the one of index ``beyond``."""
+        self._path, self.beyond, self._fields = path, beyond, fields
         self._aside = aside_of(path)
         self._spool: BinaryIO = self._aside.open("w+b")
         self.count = 0

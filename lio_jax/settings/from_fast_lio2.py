@@ -27,6 +27,7 @@ _UNITS = ("s", "ms", "us", "ns")
 _LIVOX = 1
 _ESTIMATED = ("params.initial.extrinsic_rotation_sigma", "params.initial.extrinsic_translation_sigma")
 _OUTPUT = "chooses what its node publishes or saves; a run writes a folder"
+_PUBLISHED = "a run publishes nothing; config.output.clouds=all (dense) or thinned writes a scan's points"
 
 
 def _density(value: Any, place: str) -> float:
@@ -60,6 +61,18 @@ def _scan_period(value: Any, place: str) -> float:
 
 def _updates(value: Any, place: str) -> int:
     return whole_number(value, place) + 1
+
+
+def _saved(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    if not flag(value, place):
+        return {"config.output.clouds": "none"}, ""
+    word = "all points whatever dense_publish_en says, as there; those between every n-th are not left out"
+    return {"config.output.clouds": "all"}, word
+
+
+def _scans_per_file(value: Any, place: str) -> int:
+    interval = whole_number(value, place)
+    return interval if interval > 0 else 0
 
 
 def _estimated(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
@@ -118,6 +131,10 @@ FAST_LIO2 = System(
         ),
         "runtime_pos_log_enable": nothing(_OUTPUT),
         "map_file_path": nothing(_OUTPUT),
+        "pcd_save_en": Rule(_saved),
+        "interval": converted(
+            "config.output.clouds_interval", by=_scans_per_file, word="0 for its -1: all scans in one file"
+        ),
     },
-    other_sections={"publish": nothing(_OUTPUT), "pcd_save": nothing(_OUTPUT)},
+    other_sections={"publish": nothing(_PUBLISHED)},
 )

@@ -18,6 +18,8 @@ from tests.run.inertial_drive import InertialReplay
 from tests.run.small_drive import COUNT, Replay, moving, without_points
 from tests.run.test_resume import Copying, contents, often, resumable  # noqa: F401
 
+NEAR = 30.0
+"""Points within this range are compared, m: farther ones show errors of the angular rate."""
 ALL = ["config.output.clouds=all"]
 
 
@@ -49,7 +51,7 @@ def distance_to_hall(points):
     """Return the distance of (n, 3) points from the nearest surface of the hall, m."""
     found = [np.abs(np.abs(points[:, axis]) - half) for axis, half in enumerate((17, 11, 3.5))]
     boxes = hall_drive.WORLD.solids.boxes
-    for centre, half, yaw in zip(*(np.asarray(x) for x in (boxes.center, boxes.half_size, boxes.yaw))):
+    for centre, half, yaw in zip(boxes.center, boxes.half_size, boxes.yaw, strict=True):
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
         outside = np.abs((points - centre) @ turn) - half
         beyond = np.linalg.norm(np.maximum(outside, 0), axis=1)
@@ -79,11 +81,13 @@ def test_all_points_lie_on_the_surfaces_of_the_world(in_hall):
     for number in range(len(scans)):
         points = written[number][:, :3].astype(float) @ T_hall_world[:3, :3].T + T_hall_world[:3, 3]
         distance = distance_to_hall(points)
-        # the ranges' noise is 10 mm; without compensation the first points of a scan are 0.6 m off
+        # the ranges' noise is 10 mm and the poses' error about 20 mm, which grazing beams see in full;
+        # without compensation the first points of a scan are 0.6 m off
         assert np.median(distance) < 0.015
-        assert np.quantile(distance, 0.98) < 0.05
-        raw = scans[number].points.astype(float) @ (T := hall_drive.lidar_pose((number + 1) * 0.1))[:3, :3].T
-        assert np.median(distance_to_hall(raw + T[:3, 3])) > 0.03
+        assert np.quantile(distance, 0.98) < 0.08
+        T_hall_lidar = hall_drive.lidar_pose((number + 1) * hall_drive.PERIOD)
+        uncompensated = scans[number].points @ T_hall_lidar[:3, :3].T + T_hall_lidar[:3, 3]
+        assert np.quantile(distance_to_hall(uncompensated), 0.98) > 0.3
 
 
 def test_each_file_holds_the_valid_points_of_its_scan_and_their_intensities(in_hall):
@@ -105,47 +109,31 @@ RECIPES = [
 
 
 @pytest.mark.parametrize("name", RECIPES)
-def test_points_lie_where_the_true_pose_at_their_own_time_puts_them(tmp_path, name):
-    scans = inertial_drive.scans(5, 30)
+def test_points_lie_as_the_true_motion_within_the_sweep_puts_them(tmp_path, name):
+    scans = inertial_drive.scans(40, 52)
     recording = InertialReplay(scans, inertial_drive.imu())
     settings, _ = settings_for(recording, with_overrides(recipe_settings(name), ALL))
-    run_sequence(recording, settings, tmp_path)
+    result = run_sequence(recording, settings, tmp_path)
     drive, written = inertial_drive.drive(), clouds(tmp_path)
-    T_imu_lidar = drive.info.T_imu_lidar
-    first_ns = inertial_drive.scan(0).stamp_ns
-
-    def lidar_poses(seconds):
-        return drive.poses(np.asarray(seconds)) @ T_imu_lidar
-
-    T_truth_first = lidar_poses([(scans[0].end_ns - first_ns) * 1e-9])[0]
-    T_world_first = None
+    T_imu_lidar, first_ns = drive.info.T_imu_lidar, inertial_drive.scan(0).stamp_ns
     for number, scan in enumerate(scans):
         kept = in_range(scan, settings)
         assert len(written[number]) == np.count_nonzero(kept)
         np.testing.assert_array_equal(written[number][:, 3], scan.intensity[kept])
         times, row = np.unique(scan.time[kept], return_inverse=True)
-        T_truth = lidar_poses((scan.stamp_ns - first_ns) * 1e-9 + times.astype(float))
-        moved = np.linalg.inv(T_truth_first) @ T_truth
-        true = np.einsum("nij,nj->ni", moved[row, :3, :3], scan.points[kept]) + moved[row, :3, 3]
-        if T_world_first is None:
-            # the recipe levels its world: take its first pose from the first scan, where nothing moves
-            T_world_first = rigid(true, written[number][:, :3].astype(float))
-        placed = (written[number][:, :3] - T_world_first[:3, 3]) @ T_world_first[:3, :3]
-        error = np.linalg.norm(placed - true, axis=1)
-        assert np.quantile(error, 0.9) < 0.15
-    still = np.linalg.inv(T_truth_first) @ lidar_poses([(scan.end_ns - first_ns) * 1e-9])[0]
-    uncompensated = scan.points[kept] @ still[:3, :3].T + still[:3, 3]
-    assert np.quantile(np.linalg.norm(uncompensated - true, axis=1), 0.9) > 0.3
-
-
-def rigid(before, after):
-    """Return the (4, 4) motion that takes points to others, with the least squared error."""
-    centre, other = before.mean(0), after.mean(0)
-    left, _, right = np.linalg.svd((after - other).T @ (before - centre))
-    turn = left @ np.diag([1, 1, np.sign(np.linalg.det(left @ right))]) @ right
-    motion = np.eye(4)
-    motion[:3, :3], motion[:3, 3] = turn, other - turn @ centre
-    return motion
+        seconds = (scan.stamp_ns - first_ns) * 1e-9 + np.append(times, scan.duration).astype(float)
+        T_world_lidar = drive.poses(seconds) @ T_imu_lidar
+        T_end_lidar = np.linalg.inv(T_world_lidar[-1]) @ T_world_lidar[row]
+        true = np.einsum("nij,nj->ni", T_end_lidar[:, :3, :3], scan.points[kept]) + T_end_lidar[:, :3, 3]
+        # the scan lies at its own pose of the trajectory
+        T_found = result.trajectory.poses[number] @ T_imu_lidar
+        there = (written[number][:, :3] - T_found[:3, 3]) @ T_found[:3, :3]
+        near = np.linalg.norm(true, axis=1) < NEAR
+        error = np.linalg.norm(there - true, axis=1)
+        # what is left is the error of the estimated velocity and rate, in m per sweep
+        assert np.quantile(error[near], 0.95) < (0.05 if name == "default" else 0.15)
+        skewed = np.linalg.norm(scan.points[kept] - true, axis=1)
+        assert np.quantile(skewed[near], 0.95) > 0.4
 
 
 def test_without_the_setting_there_is_no_folder(tmp_path, settings):
