@@ -75,11 +75,11 @@ def _append(file: BinaryIO, points: NDArray[np.float32]) -> int:
 def _pcd_header(count: int, fields: tuple[str, ...]) -> bytes:
     from pypcd4 import Encoding, MetaData
 
-    floats: tuple[Literal["F"], ...] = ("F",) * len(fields)
+    kind: Literal["F"] = "F"
     described = MetaData(
         fields=fields,
         size=(4,) * len(fields),
-        type=floats,
+        type=(kind,) * len(fields),
         count=(1,) * len(fields),
         points=count,
         width=count,
