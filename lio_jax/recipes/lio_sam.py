@@ -108,6 +108,7 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
         window = opened(config, params, start)
         zero = jnp.zeros((), nav.velocity.dtype)
         keyframes = no_keyframes(own.keyframes, own.corner_points, own.surface_points, zero.dtype)
+        features = empty_feature_map(config.map.capacity, of_means=own.map_points == "mean")
         return LioSamState(
             nav=nav,
             window=window,
@@ -115,7 +116,7 @@ class LioSam(Recipe[LioSamConfig, LioSamParams, LioSamState]):
             matched_at=zero - jnp.inf,
             scans=jnp.int32(0),
             error=LatestError.of(unknowns_covariance(start)),
-            map=Submap(keyframes, empty_feature_map(config.map.capacity)),
+            map=Submap(keyframes, features),
         )
 
     def step(
