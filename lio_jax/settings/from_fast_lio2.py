@@ -91,7 +91,9 @@ FAST_LIO2 = System(
     rules={
         "lid_topic": same("config.data.lidar_topic"),
         "imu_topic": same("config.data.imu_topic"),
-        "time_sync_en": nothing("stamps are taken as they are; params.extrinsics.time_offset shifts them"),
+        "time_sync_en": converted(
+            "config.data.align_clocks", by=flag, word="only clocks that differ by more than 1 s, as there"
+        ),
         "time_offset_lidar_to_imu": same("params.extrinsics.time_offset", word="the same sign"),
         "lidar_type": nothing("recognised from the messages"),
         "scan_line": nothing("rings are read or reconstructed from the points"),

@@ -275,3 +275,15 @@ def test_wrong_values_of_the_saved_clouds_are_named():
         read(yaml.safe_dump(values | {"pcd_save": {"pcd_save_en": 1}}))
     with pytest.raises(UsageError, match=r"pcd_save\.interval = 1\.5 must be a whole number\."):
         read(yaml.safe_dump(values | {"pcd_save": {"interval": 1.5}}))
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_fast_lio2s_clock_alignment_is_the_readers(wanted):
+    values = yaml.safe_load(fast_lio2(max_iteration=3))
+    values["common"]["time_sync_en"] = wanted
+    assert resolved(yaml.safe_dump(values)).run.data.align_clocks is wanted
+
+
+@pytest.mark.parametrize("key", ["mappingCornerLeafSize", "mappingSurfLeafSize"])
+def test_a_lio_sam_file_asks_for_the_means_of_voxel_grid(key):
+    assert resolved(lio_sam(N_SCAN=16, **{key: 0.3})).config.lio_sam.map_points == "mean"
