@@ -195,17 +195,18 @@ def _averaged(
         offset: of each point from its block's centre, m.
     """
     assert pmap.count is not None
+    columns = [axis * VOXELS + voxel for axis in range(3)]
     before = pmap.count.at[target, voxel].get(mode="fill", fill_value=1.0)
-    empty = computed_once(before == 0)
+    held = [pmap.point.at[target, column].get(mode="fill", fill_value=0.0) for column in columns]
+    empty = before == 0
+    # all is read before anything is written: otherwise XLA copies the tables
+    target, empty, held = computed_once((target, empty, [jnp.where(empty, 0.0, one) for one in held]))
     count = pmap.count.at[target, voxel].add(1.0, mode="drop")
     share = computed_once(1 / count.at[target, voxel].get(mode="fill", fill_value=1.0))
     point = pmap.point
-    for axis in range(3):
-        column = axis * VOXELS + voxel
-        held = pmap.point.at[target, column].get(mode="fill", fill_value=0.0)
-        held = computed_once(jnp.where(empty, 0.0, held))
-        point = point.at[target, column].set(held, mode="drop")
-        point = point.at[target, column].add(share * (offset[:, axis] - held), mode="drop")
+    for axis, column in enumerate(columns):
+        point = point.at[target, column].set(held[axis], mode="drop")
+        point = point.at[target, column].add(share * (offset[:, axis] - held[axis]), mode="drop")
     return PointMap(keys, point, None, pmap.cube, count), empty
 
 
