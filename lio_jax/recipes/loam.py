@@ -6,6 +6,20 @@ scan -> features -> scan to scan -> deskew -> scan to map -> insert -> cubes
 
 Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014. Its values are those of
 ``recipe_settings("loam")``. Inertial samples are not used.
+
+What differs from A-LOAM's program on purpose:
+
+- Matches are searched up to 15 times for a scan, each time with up to 4 steps, and no further once the pose
+  rests; there always 2 times (``config.loam.rounds``). A search keeps the matches while the points have moved
+  by less than ``params.registration.reassociation_distance``.
+- The motion within a sweep is compensated, as the pose under trial implies it; there it is switched off
+  (``config.loam.compensate``). Poses are found at the sweep's middle and carried on to its end.
+- A direction with less than ``params.registration.degeneracy_ratio`` of the strongest direction's information
+  keeps the prediction; A-LOAM has no such rule.
+- A voxel of the map holds the point nearest to its centre. A-LOAM's cubes hold the mean of a voxel's last mean
+  and of the new points. A scan's own features are averaged per voxel, as there.
+- Every scan is matched with the map (``config.loam.mapping_every``); there as many as the time allows.
+- A scan with too few matches is lost, and after a long outage a new piece of map begins.
 """
 
 import dataclasses
