@@ -25,8 +25,8 @@ What differs from FAST-LIO2's program on purpose:
 - ``config.output.clouds`` writes the points that ``config.fast_lio2.point_filter_num`` leaves out, too.
 - Features of the raw scan (``feature_extract_enable``) are not offered.
 
-There is no rule for degenerate directions, as there: the prediction's covariance decides, and only a direction
-without any information is left out.
+There is no rule for degenerate directions, as there: the prediction's covariance decides, and only a
+direction without any information is left out.
 """
 
 from collections.abc import Mapping

@@ -16,13 +16,14 @@ What differs from LIO-SAM's program on purpose:
   strongest direction's, at every step; there if an eigenvalue at the first iteration is below 100, which
   depends on the number of points.
 - Lines and planes are searched anew once the points have moved by more than
-  ``params.registration.reassociation_distance``; there at each iteration. Neighbours that lie on a line define
-  no plane (``params.knn.least_width``).
-- A voxel of the submap holds the point nearest to its centre. With ``config.lio_sam.map_points=mean`` it holds
-  the mean of its points, as there; a parameter file of LIO-SAM sets that. Points stay in the submap until its
-  cube leaves them; there the submap is made of the keyframes around again and again.
-- A scan's corners and surface points are averaged per voxel, as there, but before their motion is compensated.
-  They are compensated to the scan's end, with the translation; there to its start, rotation alone.
+  ``params.registration.reassociation_distance``; there at each iteration. Neighbours that lie on a line
+  define no plane (``params.knn.least_width``).
+- A voxel of the submap holds the point nearest to its centre. With ``config.lio_sam.map_points=mean`` it
+  holds the mean of its points, as there; a parameter file of LIO-SAM sets that. Points stay in the submap
+  until its cube leaves them; there the submap is made of the keyframes around again and again.
+- A scan's corners and surface points are averaged per voxel, as there, but before their motion is
+  compensated. They are compensated to the scan's end, with the translation; there to its start, rotation
+  alone.
 - Every scan is matched; there at most one in 0.15 s (``params.smoother.mapping_interval``).
 - The match is turned towards the inertial tilt by the shortest turn; there roll and pitch one by one.
 - The window estimates the direction of gravity. The first velocity has a sigma of 100 m/s; LIO-SAM's 1e4 is

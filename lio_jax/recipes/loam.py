@@ -16,8 +16,8 @@ What differs from A-LOAM's program on purpose:
   (``config.loam.compensate``). Poses are found at the sweep's middle and carried on to its end.
 - A direction with less than ``params.registration.degeneracy_ratio`` of the strongest direction's information
   keeps the prediction; A-LOAM has no such rule.
-- A voxel of the map holds the point nearest to its centre. A-LOAM's cubes hold the mean of a voxel's last mean
-  and of the new points. A scan's own features are averaged per voxel, as there.
+- A voxel of the map holds the point nearest to its centre. A-LOAM's cubes hold the mean of a voxel's last
+  mean and of the new points. A scan's own features are averaged per voxel, as there.
 - Every scan is matched with the map (``config.loam.mapping_every``); there as many as the time allows.
 - A scan with too few matches is lost, and after a long outage a new piece of map begins.
 """
