@@ -348,6 +348,9 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
             covariance=drift.added_to(posterior),
             new_piece=new_piece,
             evidence=evidence_of(update, prior),
+            matched=match.counted(T_world_lidar, update.measurement.aux.association.found) & ~lost
+            if config.registration.mark_matched
+            else None,
         )
 
 

@@ -267,4 +267,5 @@ def _output(
         corners=jnp.arange(corners + surfaces) < corners,
         restarted=smoothing.failed,
         smoother_unfinished=unfinished,
+        matched=match.matched,
     )

@@ -60,7 +60,7 @@ from lio_jax.recipes.lidar_covariance import LidarCovariance, ScanOnMap, mean_sq
 from lio_jax.recipes.params import RecipeConfig, RecipeParams
 from lio_jax.recipes.recipe import Needs, Outage, Output, Recipe
 from lio_jax.registration.feature_match import ScanToCubes
-from lio_jax.registration.gauss_newton import Registration, gauss_newton
+from lio_jax.registration.gauss_newton import Registration, gauss_newton, gauss_newton_with_matches
 from lio_jax.registration.knn_planes import PLANE_SHARE
 from lio_jax.registration.params import (
     GaussNewtonMatch,
@@ -263,7 +263,9 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             guess = state.T_map_odom @ T_odom_lidar
             its_turn = state.scans % config.loam.mapping_every == 0
             outage = Outage.at(params, state.unmatched + scan.interval, thin.together()[1])
-            mapping = _mapped(config, params, outage, state.map.cubes, thin, guess, odometry, its_turn)
+            mapping, matched = _mapped(
+                config, params, outage, state.map.cubes, thin, guess, odometry, its_turn
+            )
             lost = (mapping.status == LOST) & ~first
             new_piece = outage.begins_piece(lost, params.registration)
             T = mapping.T_world_lidar
@@ -335,6 +337,7 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             map_dropped=added[0].dropped + added[1].dropped,
             covariance=covariance,
             new_piece=new_piece,
+            matched=matched & ~lost if config.registration.mark_matched else None,
             corners=jnp.arange(len(placed.corner_mask) + len(placed.surface_mask)) < len(placed.corner_mask),
         )
 
@@ -365,10 +368,13 @@ def _mapped(
     guess: jaxlie.SE3,
     odometry: Registration,
     its_turn: Bool[Array, ""],
-) -> Registration:
-    """Return the match with the map, or that with the last scan if it is not the map's turn."""
+) -> tuple[Registration, Bool[Array, " k"]]:
+    """Return the match with the map, or that with the last scan if it is not the map's turn.
 
-    def with_map() -> Registration:
+    The second result says which points, corners first, were matched with the map.
+    """
+
+    def with_map() -> tuple[Registration, Array]:
         match = ScanToCubes(
             points_at=FixedPoints(points),
             T_predicted=guess,
@@ -380,15 +386,22 @@ def _mapped(
             neighbours=config.knn.neighbours,
             cubes=params.cubes,
         )
-        found = gauss_newton(match, config.loam.rounds, config.registration.max_iterations)
+        bounds = config.loam.rounds, config.registration.max_iterations
+        found, matches = gauss_newton_with_matches(match, *bounds)
+        # nobody asks: nothing is computed
+        matched = match.counted(found.T_world_lidar, matches) if marked else nothing
         # the points' compensation rests on the odometry
         unfinished = (found.status == CONVERGED) & (odometry.status == ITERATION_LIMIT)
-        return dataclasses.replace(found, status=jnp.where(unfinished, ITERATION_LIMIT, found.status))
+        status = jnp.where(unfinished, ITERATION_LIMIT, found.status)
+        return dataclasses.replace(found, status=status), matched
 
+    marked, nothing = config.registration.mark_matched, jnp.zeros_like(points.together()[1])
     if config.loam.mapping_every == 1:
         return with_map()
     return jax.lax.cond(
-        its_turn, with_map, lambda: dataclasses.replace(odometry, T_world_lidar=jaxlie.SE3(guess.wxyz_xyz))
+        its_turn,
+        with_map,
+        lambda: (dataclasses.replace(odometry, T_world_lidar=jaxlie.SE3(guess.wxyz_xyz)), nothing),
     )
 
 

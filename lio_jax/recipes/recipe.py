@@ -94,6 +94,9 @@ class Output(eqx.Module):
     """True if the smoother diverged and was started again; None from recipes without a smoother."""
     keyframes: KeyframeTable | None = None
     """The keyframes of the submap; None from recipes without keyframes."""
+    matched: Bool[Array, " m"] | None = None
+    """True for ``points`` whose distance from the map counted in the match; None unless
+    ``config.registration.mark_matched`` is true."""
     smoother_unfinished: Bool[Array, ""] | None = None
     """The match converged, and the smoother reached its largest number of linearisations; None from recipes
     without one."""

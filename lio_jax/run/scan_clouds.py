@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -37,8 +37,10 @@ from lio_jax.run.track import ScanResult
 from lio_jax.settings.settings import Settings, recipe_of
 
 FOLDER = "clouds"
-_OURS = re.compile(r"(\d{6,}|\.\d{6,}\.[0-9a-f]{8})\.pcd")
-_SPOOL = re.compile(r"\.\d{6,}\.[0-9a-f]{8}\.pcd")
+MATCHED = "_matched"
+"""Ends the names of the files of matched points."""
+_SPOOL = re.compile(rf"\.\d{{6,}}({MATCHED})?\.[0-9a-f]{{8}}\.pcd")
+_OURS = re.compile(rf"\d{{6,}}({MATCHED})?\.pcd|{_SPOOL.pattern}")
 _WAITING = 4
 """Number of scans that may wait to be written; beyond that the run waits."""
 _AT_ONCE = 1 << 18
@@ -110,7 +112,11 @@ def _at_the_end(
 
 
 class ScanClouds(Sink):
-    """Writes clouds/NNNNNN.pcd: the points of the scans from number NNNNNN of the recording on."""
+    """Writes clouds/NNNNNN.pcd: the points of the scans from number NNNNNN of the recording on.
+
+    Where the output says which points were matched, NNNNNN_matched.pcd holds these: FAST-LIO2's
+    /cloud_effected.
+    """
 
     def __init__(self, folder: Path, settings: Settings, start: int = 0) -> None:
         """Begin a folder of clouds; a thread places and writes the points.
@@ -120,17 +126,18 @@ class ScanClouds(Sink):
             settings: of the run; ``config.output.clouds`` is not "none".
             start: number of the first scan in the recording.
         """
-        self._folder, self._start = folder / FOLDER, start
+        self._folder = folder / FOLDER
         self._folder.mkdir(exist_ok=True)
         output = settings.run.output
-        self._all, self._interval = output.clouds == "all", output.clouds_interval
+        self._all = output.clouds == "all"
+        self._clouds = _Files(self._folder, "", output.clouds_interval, start)
+        self._matched = _Files(self._folder, MATCHED, output.clouds_interval, start)
+        self._error: Exception | None = None
         self._params = settings.params()
         self._place = programs(placed_scan, recipe_of(settings).compensates)
         self._last: ScanResult | None = None
         self._opening: ScanResult | None = None
-        self._file: _OneFile | None = None
-        self._fields: tuple[str, ...] = XYZ
-        self._files = self._points = 0
+        self._fields: tuple[str, ...] = ()
         self._writer = ThreadPoolExecutor(1, "clouds")
         self._pending: deque[Future[None]] = deque()
 
@@ -154,13 +161,13 @@ class ScanClouds(Sink):
         while self._pending:
             self._pending.popleft().result()
         self._writer.submit(self._complete).result()
-        run.metrics["clouds"] = {"files": self._files, "points": self._points}
+        run.metrics["clouds"] = {"files": self._clouds.files, "points": self._clouds.points}
 
     def close(self) -> None:
         """End the thread; a file that was not completed leaves nothing."""
         self._writer.shutdown(cancel_futures=True)
-        if self._file is not None:
-            self._file.close()
+        self._clouds.close()
+        self._matched.close()
         with suppress(OSError):  # the folder holds clouds
             self._folder.rmdir()
 
@@ -176,44 +183,80 @@ class ScanClouds(Sink):
         self._pending.append(self._writer.submit(self._add, result, start, end))
 
     def _add(self, result: ScanResult, start: ScanResult, end: ScanResult) -> None:
-        if self._file is not None and result.index >= self._file.beyond:
-            self._complete()
-        rows = self._rows(result, start, end)
-        if not len(rows):
-            return
-        if self._file is None:
-            first = result.index - result.index % self._interval if self._interval else 0
-            beyond = first + self._interval if self._interval else math.inf
-            self._file = _OneFile(self._folder / f"{self._start + first:06d}.pcd", beyond, self._fields)
-        self._file.append(rows)
+        # a file that lacks a scan must not be completed by a later one
+        if self._error is not None:
+            raise self._error
+        try:
+            output = result.output
+            if np.isfinite(result.T_world_imu).all():
+                rows = (
+                    self._all_points(result, start, end) if self._all else _those(output, output.points_mask)
+                )
+                self._clouds.add(result.index, rows, self._fields if self._all else XYZ)
+                if output.matched is not None:
+                    self._matched.add(result.index, _those(output, output.matched), XYZ)
+        except Exception as error:
+            self._error = error
+            raise
 
     def _complete(self) -> None:
-        if self._file is not None:
-            file, self._file = self._file, None
-            try:
-                file.write()
-            finally:
-                file.close()
-            self._files += 1
-            self._points += file.count
+        if self._error is None:
+            self._clouds.complete()
+            self._matched.complete()
 
-    def _rows(self, result: ScanResult, start: ScanResult, end: ScanResult) -> NDArray[np.float32]:
+    def _all_points(self, result: ScanResult, start: ScanResult, end: ScanResult) -> NDArray[np.float32]:
         """Return the points of a scan, a column for each field, m in world."""
         output, fed = result.output, result.fed
-        if not np.isfinite(result.T_world_imu).all() or fed is None:
-            return np.zeros((0, len(self._fields)), np.float32)
-        if not self._all:
-            points = np.asarray(output.points)[np.asarray(output.points_mask)]
-            return (points + np.asarray(output.origin)).astype(np.float32)
+        assert fed is not None
         interval = np.float32((end.stamp_ns - start.stamp_ns) * 1e-9)
         leg = Leg(start.nav, end.nav, jnp.array(interval), jnp.array(result is start))
         T_matched = output.registration.T_world_lidar
         points, mask = self._place(self._params, result.nav, T_matched, leg, fed.scan, fed.imu)
         kept, intensity = np.asarray(mask), np.asarray(fed.scan.intensity)
-        if not self._points and self._file is None:
+        if not self._fields:
             self._fields = (*XYZ, "intensity") if intensity[kept].any() else XYZ
         columns = [np.asarray(points)[kept], intensity[kept, None]][: len(self._fields) - 2]
         return np.concatenate(columns, axis=1, dtype=np.float32)
+
+
+def _those(output: Any, mask: Any) -> NDArray[np.float32]:
+    """Return the points of an output that a mask marks, (n, 3) m in world."""
+    points = np.asarray(output.points)[np.asarray(mask)]
+    return (points + np.asarray(output.origin)).astype(np.float32)
+
+
+class _Files:
+    """The files of one kind of points, one after the other."""
+
+    def __init__(self, folder: Path, ending: str, interval: int, start: int) -> None:
+        self._folder, self._ending, self._interval, self._start = folder, ending, interval, start
+        self._file: _OneFile | None = None
+        self.files = self.points = 0
+
+    def add(self, index: int, rows: NDArray[np.float32], fields: tuple[str, ...]) -> None:
+        """Add a scan's rows; files before it are completed."""
+        if self._file is not None and index >= self._file.beyond:
+            self.complete()
+        if not len(rows):
+            return
+        if self._file is None:
+            first = index - index % self._interval if self._interval else 0
+            beyond = first + self._interval if self._interval else math.inf
+            name = f"{self._start + first:06d}{self._ending}.pcd"
+            self._file = _OneFile(self._folder / name, beyond, fields)
+        self._file.append(rows)
+
+    def complete(self) -> None:
+        if self._file is not None:
+            self._file.write()
+            self.files += 1
+            self.points += self._file.count
+            self.close()
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
 
 
 class _OneFile:
