@@ -263,7 +263,7 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             guess = state.T_map_odom @ T_odom_lidar
             its_turn = state.scans % config.loam.mapping_every == 0
             outage = Outage.at(params, state.unmatched + scan.interval, thin.together()[1])
-            mapping, matched = _mapped(
+            mapping, counted = _mapped(
                 config, params, outage, state.map.cubes, thin, guess, odometry, its_turn
             )
             lost = (mapping.status == LOST) & ~first
@@ -337,7 +337,7 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             map_dropped=added[0].dropped + added[1].dropped,
             covariance=covariance,
             new_piece=new_piece,
-            matched=matched & ~lost if config.registration.mark_matched else None,
+            matched=counted & ~lost if config.registration.mark_matched else None,
             corners=jnp.arange(len(placed.corner_mask) + len(placed.surface_mask)) < len(placed.corner_mask),
         )
 
