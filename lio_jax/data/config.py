@@ -38,6 +38,9 @@ class DataConfig:
     LiDAR whose messages hold parts of it."""
     beams: int = static(0, least=0)
     """Beams for ring reconstruction where the recording holds no ring; 0: 16, 32 or 64 by the data."""
+    align_clocks: bool = static(False)
+    """Shift the inertial samples of a bag once where their stamps differ by more than a second from those of
+    the scans that were received with them. What is left of the difference is the delay of the messages."""
     scan_period: float = static(0.1, "s", above=0)
     """Duration of one sweep, and the time between scans that have no stamps, where it cannot be read from the
     data."""

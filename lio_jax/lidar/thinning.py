@@ -123,6 +123,13 @@ def thinned(
     )
 
 
+def rows_of(thin: ThinnedScan, marks: Bool[Array, " k"]) -> Bool[Array, " m"]:
+    """Return the marks of the k points to match as marks of all points of the thinned scan."""
+    chosen = thin.matched
+    rows = jnp.where(chosen.mask & marks, chosen.index, len(thin.mask))
+    return jnp.zeros_like(thin.mask).at[rows].set(True, mode="drop")
+
+
 class MeanPoints(eqx.Module):
     """One mean point per occupied voxel, padded to k, the real ones first."""
 

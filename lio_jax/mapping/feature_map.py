@@ -1,4 +1,4 @@
-"""Maps of corners and surface points: one point per voxel, in cubes (LOAM) or from keyframes (LIO-SAM)."""
+"""Maps of corners and surface points: a point per voxel, in cubes (LOAM) or from keyframes (LIO-SAM)."""
 
 from collections.abc import Callable
 
@@ -64,9 +64,9 @@ class Frames(eqx.Module):
     surface: Frame
 
 
-def empty_feature_map(capacity: int, dtype: DTypeLike = jnp.float32) -> FeatureMap:
+def empty_feature_map(capacity: int, dtype: DTypeLike = jnp.float32, of_means: bool = False) -> FeatureMap:
     """Return a map with ``capacity`` free blocks of either kind, its boxes around the world's origin."""
-    return FeatureMap(empty_map(capacity, dtype), empty_map(capacity, dtype))
+    return FeatureMap(empty_map(capacity, dtype, of_means), empty_map(capacity, dtype, of_means))
 
 
 def frames_at(position: Float[Array, "3"], map_params: FeatureMapParams) -> Frames:
@@ -128,8 +128,8 @@ def added_to(
         )
         # last: XLA copies the map if another operation reads it afterwards
         moved = follow(inserted, frame, block)
-        added = insertion.added
-        maps.append(following(moved, before, inserted, added, placed, frame.anchor, size))
+        entered = insertion.moved
+        maps.append(following(moved, before, inserted, entered, placed, frame.anchor, size))
         insertions.append(insertion)
     return FeatureMap(*maps), insertions[0], insertions[1]
 
@@ -284,7 +284,7 @@ def rebuilt(
     keyframes = with_poses(submap.keyframes, keyframes_T_world_lidar, T_world_lidar, time, settings)
     frames = frames_at(T_world_lidar.translation(), map_params)
     block, point = submap.features.corner.block, submap.features.corner.point
-    empty = empty_feature_map(len(block), point.dtype)
+    empty = empty_feature_map(len(block), point.dtype, submap.features.corner.count is not None)
     empty = eqx.tree_at(
         lambda both: (both.corner.cube, both.surface.cube),
         empty,

@@ -1,5 +1,8 @@
 """A hashed map of points, one per voxel, in a cube that follows the sensor; it replaces FAST-LIO2's ikd-tree.
 
+The point of a voxel is the one nearest to its centre (FAST-LIO2), or the mean of all points that were put
+into it, as PCL's VoxelGrid leaves it (LIO-SAM).
+
 Voxels are stored in blocks of 3 x 3 x 3, so one look-up of a key finds 27 of them. A point's coordinates are
 relative to its block's centre, and blocks have integer coordinates, so float32 is precise at any distance
 from the world's origin. Points are given in an *anchored* frame: the world shifted by a whole number of
@@ -29,10 +32,12 @@ class PointMap(eqx.Module):
     """Integer coordinates of the block in each slot; ``FREE`` in a free slot."""
     point: Float[Array, "c 81"]
     """x of the 27 voxels' points, then y, then z, m from the block's centre; infinite in empty voxels."""
-    off_centre: Float[Array, "c 27"]
-    """Distance of each point from its voxel's centre, m; infinite in empty voxels."""
+    off_centre: Float[Array, "c 27"] | None
+    """Distance of each point from its voxel's centre, m; infinite in empty voxels. None in a map of means."""
     cube: Int32[Array, "3"]
     """The block at the cube's centre."""
+    count: Float[Array, "c 27"] | None = None
+    """Number of points whose mean each voxel holds; None in a map of the points nearest to the centres."""
 
     def varying(self) -> "PointMap":
         """Return a tree of booleans: the points have a derivative."""
@@ -44,23 +49,27 @@ class PointInsertion(eqx.Module):
     """The result of an insertion."""
 
     added: Bool[Array, " m"]
-    """True for points that are now in the map."""
+    """True for points that are now in the map; in a map of means, for points in voxels that were empty."""
+    moved: Bool[Array, " m"]
+    """True for points that a point of the map moves with: those of ``added``, or all that entered a mean."""
     dropped: Int32[Array, ""]
     """Number of points whose block found no free slot, because the table is too full."""
 
 
-def empty_map(capacity: int, dtype: DTypeLike = jnp.float32) -> PointMap:
+def empty_map(capacity: int, dtype: DTypeLike = jnp.float32, of_means: bool = False) -> PointMap:
     """Return a map of free blocks, with its cube around the world's origin.
 
     Args:
         capacity: number of blocks, a power of two.
         dtype: of the coordinates.
+        of_means: whether a voxel holds the mean of its points, in place of the one nearest to its centre.
     """
     return PointMap(
         block=free_keys(capacity),
         point=jnp.full((capacity, 3 * VOXELS), jnp.inf, dtype),
-        off_centre=jnp.full((capacity, VOXELS), jnp.inf, dtype),
+        off_centre=None if of_means else jnp.full((capacity, VOXELS), jnp.inf, dtype),
         cube=jnp.zeros(3, jnp.int32),
+        count=jnp.zeros((capacity, VOXELS), dtype) if of_means else None,
     )
 
 
@@ -110,8 +119,9 @@ def _cleared(pmap: PointMap, centre: Int32[Array, "3"], half_sides: Float[Array,
         return PointMap(
             jnp.where(gone, FREE, pmap.block),
             jnp.where(gone, jnp.inf, pmap.point),
-            jnp.where(gone, jnp.inf, pmap.off_centre),
+            None if pmap.off_centre is None else jnp.where(gone, jnp.inf, pmap.off_centre),
             centre,
+            None if pmap.count is None else jnp.where(gone, 0.0, pmap.count),
         )
 
     # a loop of zero or one turns works in place; a conditional would copy the map each time
@@ -129,6 +139,8 @@ def insert(
 ) -> tuple[PointMap, PointInsertion]:
     """Keep in each voxel the point nearest to its centre: the one that the map holds, or one of ``points``.
 
+    A map of means takes all of them: each voxel's point becomes the mean of those that were ever put there.
+
     Args:
         pmap: the map; donate it.
         points: m, in the frame anchored at ``anchor``.
@@ -136,7 +148,8 @@ def insert(
         anchor: block whose lower corner is the origin of ``points``.
         voxel_size: edge length of a voxel, m.
         half_side: half of the cube's edge, or of the box's three edges, blocks; points outside are left out.
-        nearer_by: a new point replaces the old one if it is nearer to the centre by more than this, m.
+        nearer_by: a new point replaces the old one if it is nearer to the centre by more than this, m. It has
+            no effect on a map of means.
     """
     capacity = pmap.block.shape[0]
     pmap, points = jax.lax.stop_gradient((pmap, points.astype(pmap.point.dtype)))
@@ -144,6 +157,11 @@ def insert(
     inside = mask & _inside(block, pmap.cube, half_side)
     keys, slot = computed_once(claim_slots(pmap.block, block, inside))
     voxel = _voxel_in_block(cell, local)
+    homeless = jnp.sum(inside & (slot < 0), dtype=jnp.int32)
+    if pmap.off_centre is None:
+        offset = points - (local + 0.5) * EDGE * voxel_size
+        averaged, filled = _averaged(pmap, keys, jnp.where(slot >= 0, slot, capacity), voxel, offset)
+        return averaged, PointInsertion(filled, slot >= 0, homeless)
     x, y, z = (points[:, axis] - (cell[:, axis] + 0.5) * voxel_size for axis in range(3))
     off_centre = jnp.sqrt(x**2 + y**2 + z**2)
     target = jnp.where(slot >= 0, slot, capacity)
@@ -157,35 +175,70 @@ def insert(
     for axis in range(3):
         offset = points[:, axis] - (local[:, axis] + 0.5) * EDGE * voxel_size
         point = point.at[target, axis * VOXELS + voxel].set(offset, mode="drop")
-    homeless = jnp.sum(inside & (slot < 0), dtype=jnp.int32)
-    return PointMap(keys, point, best, pmap.cube), PointInsertion(added, homeless)
+    return PointMap(keys, point, best, pmap.cube), PointInsertion(added, added, homeless)
+
+
+def _averaged(
+    pmap: PointMap,
+    keys: Int32[Array, "c 3"],
+    target: Int32[Array, " m"],
+    voxel: Int32[Array, " m"],
+    offset: Float[Array, "m 3"],
+) -> tuple[PointMap, Bool[Array, " m"]]:
+    """Return a map of means with points in it, and which of these are in voxels that were empty.
+
+    Args:
+        pmap: the map before.
+        keys: its blocks after new ones were claimed.
+        target: slot of each point's block; the capacity where it has none.
+        voxel: number of each point's voxel in its block.
+        offset: of each point from its block's centre, m.
+    """
+    assert pmap.count is not None
+    columns = [axis * VOXELS + voxel for axis in range(3)]
+    before = pmap.count.at[target, voxel].get(mode="fill", fill_value=1.0)
+    held = [pmap.point.at[target, column].get(mode="fill", fill_value=0.0) for column in columns]
+    empty = before == 0
+    # all is read before anything is written: otherwise XLA copies the tables
+    target, empty, held = computed_once((target, empty, [jnp.where(empty, 0.0, one) for one in held]))
+    count = pmap.count.at[target, voxel].add(1.0, mode="drop")
+    share = computed_once(1 / count.at[target, voxel].get(mode="fill", fill_value=1.0))
+    point = pmap.point
+    for axis, column in enumerate(columns):
+        point = point.at[target, column].set(held[axis], mode="drop")
+        point = point.at[target, column].add(share * (offset[:, axis] - held[axis]), mode="drop")
+    return PointMap(keys, point, None, pmap.cube, count), empty
 
 
 def following(
     pmap: PointMap,
     before: PointMap,
     inserted: PointMap,
-    added: Bool[Array, " m"],
+    moved: Bool[Array, " m"],
     points: Float[Array, "m 3"],
     anchor: Int32[Array, "3"],
     voxel_size: Float[Array, ""],
 ) -> PointMap:
     """Return a map after an insertion with the derivative of its points.
 
-    Which voxel keeps which point is a choice, which the derivative holds.
+    Which voxel keeps which point is a choice, which the derivative holds. A mean is smooth in its points.
 
     Args:
         pmap: the map after :func:`insert`, and after its cube was moved.
         before: the map before the insertion; its points may have a derivative.
         inserted: the map between the insertion and the move.
-        added: which of the m points are in the map.
+        moved: which of the m points are in the map, or entered a mean of it.
         points: as they were inserted, m, in the anchored frame; they may have a derivative.
         anchor: block whose lower corner is the origin of ``points``.
         voxel_size: edge length of a voxel, m.
     """
     still = jax.lax.stop_gradient(pmap)
-    choices = jax.lax.stop_gradient((inserted.block, added, points, anchor, voxel_size))
-    point = with_derivative_of(still.point, _points_after, before.point, points, choices)
+    choices = jax.lax.stop_gradient((inserted.block, moved, points, anchor, voxel_size))
+    if inserted.count is None:
+        point = with_derivative_of(still.point, _points_after, before.point, points, choices)
+    else:
+        counts = jax.lax.stop_gradient((before.count, inserted.count))
+        point = with_derivative_of(still.point, _means_after, before.point, points, choices, counts)
     return eqx.tree_at(lambda one: one.point, still, point)
 
 
@@ -200,6 +253,25 @@ def _points_after(before: Float[Array, "c 81"], points: Float[Array, "m 3"], cho
     offset = (points - (local + 0.5) * EDGE * voxel_size).astype(before.dtype)
     columns = jnp.arange(3, dtype=jnp.int32)[:, None] * VOXELS + voxel
     return before.at[slot[None], columns].set(offset.T, mode="drop", unique_indices=True)
+
+
+def _means_after(
+    before: Float[Array, "c 81"], points: Float[Array, "m 3"], choices: tuple, counts: tuple
+) -> Array:
+    """Return the means after an insertion whose choices are known.
+
+    Only the slope is of use: the mean of a voxel that was empty is added to the infinity that stood there.
+    """
+    block, moved, known, anchor, voxel_size = choices
+    cell, local, key = _places(known, moved, anchor, voxel_size)
+    slot = jnp.where(moved, find_slots(block, key), len(before))
+    voxel = _voxel_in_block(cell, local)
+    count, after = (table.at[slot, voxel].get(mode="fill", fill_value=1.0) for table in counts)
+    offset = (points - (local + 0.5) * EDGE * voxel_size).astype(before.dtype)
+    columns = jnp.arange(3, dtype=jnp.int32)[:, None] * VOXELS + voxel
+    held = before.at[slot[None], columns].get(mode="fill", fill_value=0.0)
+    change = (offset.T - jnp.where(count == 0, 0.0, held)) / after
+    return before.at[slot[None], columns].add(change, mode="drop")
 
 
 def _places(

@@ -5,6 +5,28 @@ imu  -> propagate ----/----------------------/
 
 Xu, Cai, He, Lin & Zhang, "FAST-LIO2: Fast direct LiDAR-inertial odometry", T-RO 2022. Its values are those of
 ``recipe_settings("fast_lio2")``. Without inertial samples the velocity is taken as constant.
+
+What differs from FAST-LIO2's program on purpose:
+
+- The world is level at the start. There the first pose of the IMU is the world, and gravity leans in it.
+- At the start the difference between the mean specific force and gravity is the accelerometer's bias. There
+  all samples are scaled by gravity over the mean. A vehicle that moves is recognised, and its biases stay
+  zero. Samples in g are recognised by the reader.
+- A scan has up to 8 updates (there 4). Neighbours are searched anew once the points have moved by more than
+  ``params.registration.reassociation_distance``; there at the first update, and again when the step is small.
+- Five neighbours that lie on a line define no plane (``params.knn.least_width``).
+- A point replaces the one in its voxel if it is nearer to the centre by more than
+  ``params.point_map.nearer_by``; there by any distance.
+- The covariance contains the map's error, unless ``config.fast_lio2.exact_map`` is true.
+- A scan with fewer than ``params.registration.min_matches`` matches is lost: its pose is the prediction, and
+  after a long outage a new piece of map begins with it. There one match is enough.
+- Clocks that differ by more than a second are aligned by the reader of bags, for any sensor
+  (``config.data.align_clocks``); there by the receiver of Livox messages. Smaller lags may be a state.
+- ``config.output.clouds`` writes the points that ``config.fast_lio2.point_filter_num`` leaves out, too.
+- Features of the raw scan (``feature_extract_enable``) are not offered.
+
+There is no rule for degenerate directions, as there: the prediction's covariance decides, and only a
+direction without any information is left out.
 """
 
 from collections.abc import Mapping
@@ -326,6 +348,9 @@ class FastLio2(Recipe[FastLio2Config, FastLio2Params, FastLio2State]):
             covariance=drift.added_to(posterior),
             new_piece=new_piece,
             evidence=evidence_of(update, prior),
+            matched=match.counted(T_world_lidar, update.measurement.aux.association.found) & ~lost
+            if config.registration.mark_matched
+            else None,
         )
 
 

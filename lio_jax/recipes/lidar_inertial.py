@@ -17,7 +17,7 @@ from lio_jax.core.types import ITERATION_LIMIT, ImuBatch, NavState, Scan
 from lio_jax.core.xla import computed_once
 from lio_jax.estimation.map_drift import MapDrift
 from lio_jax.imu.path import Path, deskew_along
-from lio_jax.lidar.thinning import ThinnedScan, thinned
+from lio_jax.lidar.thinning import ThinnedScan, rows_of, thinned
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.voxel_map import VoxelMap, empty_map, following, insert
 from lio_jax.recipes import recipe
@@ -217,6 +217,9 @@ def step(
         new_piece=new_piece,
         evidence=evidence_of(update, prior, evidence),
         shown_by_noise=by_noise,
+        matched=rows_of(thin, match.counted(T_matched, matches) & ~lost)
+        if config.registration.mark_matched
+        else None,
     )
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int32
 
 from lio_jax.core.types import LOST, NavState, Scan, initial_nav_state
 from lio_jax.lidar.deskew import TrialMotion, deskew_constant_velocity, twist_without_turn
-from lio_jax.lidar.thinning import ThinnedScan, thinned
+from lio_jax.lidar.thinning import ThinnedScan, rows_of, thinned
 from lio_jax.mapping.frame import Frame
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, following, insert
 from lio_jax.recipes import recipe
@@ -196,6 +196,9 @@ def step(
         map_dropped=added.dropped,
         covariance=covariance,
         new_piece=new_piece,
+        matched=rows_of(thin, match.counted(T, matches) & ~lost)
+        if config.registration.mark_matched
+        else None,
     )
 
 

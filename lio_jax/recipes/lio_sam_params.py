@@ -87,6 +87,9 @@ class LioSamSizes:
     lidar_noise: Literal["fixed", "information"] = static("information")
     """Noise of a scan match in the smoother: its information, and the pose is the smoothed one; or LIO-SAM's
     fixed sigmas of ``params.smoother``, and the pose is the matched one."""
+    map_points: Literal["nearest", "mean"] = static("nearest")
+    """Point of each voxel of the submap: the one nearest to the voxel's centre; or the mean of the points of
+    all keyframes that have entered, as LIO-SAM's VoxelGrid leaves it."""
     keyframes: int = static(256, above=0)
     """Capacity of keyframes on the device. Beyond it the submap's spent keyframes are dropped first, then the
     farthest ones. A run keeps these on the host, and they come back near the vehicle."""

@@ -50,7 +50,7 @@ from lio_jax.recipes.smoothed_odometry import (
     within_limits,
 )
 from lio_jax.registration.feature_match import ScanToSubmap
-from lio_jax.registration.gauss_newton import Registration, gauss_newton
+from lio_jax.registration.gauss_newton import Registration, gauss_newton_with_matches
 from lio_jax.registration.scan_match import FixedPoints
 
 _TIME_SLACK = 1e-3
@@ -201,6 +201,8 @@ class MapMatch(eqx.Module):
     """The scan could not be matched although there was a map."""
     new_piece: Bool[Array, ""]
     """A new piece of map begins with the scan, at the predicted pose."""
+    matched: Bool[Array, " k"] | None
+    """Which features, corners first, were matched; None unless ``config.registration.mark_matched``."""
 
 
 def scan_to_map(
@@ -237,7 +239,7 @@ def scan_to_map(
         knn=params.knn,
         neighbours=config.knn.neighbours,
     )
-    found = gauss_newton(match, config.registration.max_iterations)
+    found, matches = gauss_newton_with_matches(match, config.registration.max_iterations)
     due = clock.time - state.matched_at >= params.smoother.mapping_interval - _TIME_SLACK
     lost = ((found.status == LOST) | ~enough) & ~clock.first
     used = due & ~lost & ~clock.first
@@ -246,7 +248,9 @@ def scan_to_map(
     T_matched = drawn_to_tilt(T_matched, attitude, params.smoother.tilt_weight)
     T_world_imu = jaxlie.SE3(jnp.where(used, T_matched.wxyz_xyz, guess.wxyz_xyz))
     new_piece = lost & enough & outage.is_long
-    return MapMatch(found, T_world_imu, used, lost, new_piece)
+    marked = config.registration.mark_matched
+    matched = match.counted(found.T_world_lidar, matches) & ~lost if marked else None
+    return MapMatch(found, T_world_imu, used, lost, new_piece, matched)
 
 
 class Smoothing(eqx.Module):

@@ -6,6 +6,20 @@ scan -> features -> scan to scan -> deskew -> scan to map -> insert -> cubes
 
 Zhang & Singh, "LOAM: Lidar odometry and mapping in real-time", RSS 2014. Its values are those of
 ``recipe_settings("loam")``. Inertial samples are not used.
+
+What differs from A-LOAM's program on purpose:
+
+- Matches are searched up to 15 times for a scan, each time with up to 4 steps, and no further once the pose
+  rests; there always 2 times (``config.loam.rounds``). A search keeps the matches while the points have moved
+  by less than ``params.registration.reassociation_distance``.
+- The motion within a sweep is compensated, as the pose under trial implies it; there it is switched off
+  (``config.loam.compensate``). Poses are found at the sweep's middle and carried on to its end.
+- A direction with less than ``params.registration.degeneracy_ratio`` of the strongest direction's information
+  keeps the prediction; A-LOAM has no such rule.
+- A voxel of the map holds the point nearest to its centre. A-LOAM's cubes hold the mean of a voxel's last
+  mean and of the new points. A scan's own features are averaged per voxel, as there.
+- Every scan is matched with the map (``config.loam.mapping_every``); there as many as the time allows.
+- A scan with too few matches is lost, and after a long outage a new piece of map begins.
 """
 
 import dataclasses
@@ -46,7 +60,7 @@ from lio_jax.recipes.lidar_covariance import LidarCovariance, ScanOnMap, mean_sq
 from lio_jax.recipes.params import RecipeConfig, RecipeParams
 from lio_jax.recipes.recipe import Needs, Outage, Output, Recipe
 from lio_jax.registration.feature_match import ScanToCubes
-from lio_jax.registration.gauss_newton import Registration, gauss_newton
+from lio_jax.registration.gauss_newton import Registration, gauss_newton, gauss_newton_with_matches
 from lio_jax.registration.knn_planes import PLANE_SHARE
 from lio_jax.registration.params import (
     GaussNewtonMatch,
@@ -165,6 +179,10 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
         "params.map.corner_voxel_size": 0.1,
     }
 
+    @property
+    def compensates(self) -> bool:
+        return self.config.loam.compensate
+
     def init(self, params: LoamParams, imu: ImuBatch | None = None) -> LoamState:
         """Return the state before the first scan: at the world's origin, with an empty map.
 
@@ -245,7 +263,9 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             guess = state.T_map_odom @ T_odom_lidar
             its_turn = state.scans % config.loam.mapping_every == 0
             outage = Outage.at(params, state.unmatched + scan.interval, thin.together()[1])
-            mapping = _mapped(config, params, outage, state.map.cubes, thin, guess, odometry, its_turn)
+            mapping, counted = _mapped(
+                config, params, outage, state.map.cubes, thin, guess, odometry, its_turn
+            )
             lost = (mapping.status == LOST) & ~first
             new_piece = outage.begins_piece(lost, params.registration)
             T = mapping.T_world_lidar
@@ -317,6 +337,7 @@ class Loam(Recipe[LoamConfig, LoamParams, LoamState]):
             map_dropped=added[0].dropped + added[1].dropped,
             covariance=covariance,
             new_piece=new_piece,
+            matched=counted & ~lost if config.registration.mark_matched else None,
             corners=jnp.arange(len(placed.corner_mask) + len(placed.surface_mask)) < len(placed.corner_mask),
         )
 
@@ -347,10 +368,13 @@ def _mapped(
     guess: jaxlie.SE3,
     odometry: Registration,
     its_turn: Bool[Array, ""],
-) -> Registration:
-    """Return the match with the map, or that with the last scan if it is not the map's turn."""
+) -> tuple[Registration, Bool[Array, " k"]]:
+    """Return the match with the map, or that with the last scan if it is not the map's turn.
 
-    def with_map() -> Registration:
+    The second result says which points, corners first, were matched with the map.
+    """
+
+    def with_map() -> tuple[Registration, Array]:
         match = ScanToCubes(
             points_at=FixedPoints(points),
             T_predicted=guess,
@@ -362,15 +386,22 @@ def _mapped(
             neighbours=config.knn.neighbours,
             cubes=params.cubes,
         )
-        found = gauss_newton(match, config.loam.rounds, config.registration.max_iterations)
+        bounds = config.loam.rounds, config.registration.max_iterations
+        found, matches = gauss_newton_with_matches(match, *bounds)
+        # nobody asks: nothing is computed
+        matched = match.counted(found.T_world_lidar, matches) if marked else nothing
         # the points' compensation rests on the odometry
         unfinished = (found.status == CONVERGED) & (odometry.status == ITERATION_LIMIT)
-        return dataclasses.replace(found, status=jnp.where(unfinished, ITERATION_LIMIT, found.status))
+        status = jnp.where(unfinished, ITERATION_LIMIT, found.status)
+        return dataclasses.replace(found, status=status), matched
 
+    marked, nothing = config.registration.mark_matched, jnp.zeros_like(points.together()[1])
     if config.loam.mapping_every == 1:
         return with_map()
     return jax.lax.cond(
-        its_turn, with_map, lambda: dataclasses.replace(odometry, T_world_lidar=jaxlie.SE3(guess.wxyz_xyz))
+        its_turn,
+        with_map,
+        lambda: (dataclasses.replace(odometry, T_world_lidar=jaxlie.SE3(guess.wxyz_xyz)), nothing),
     )
 
 

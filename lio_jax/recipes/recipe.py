@@ -94,6 +94,9 @@ class Output(eqx.Module):
     """True if the smoother diverged and was started again; None from recipes without a smoother."""
     keyframes: KeyframeTable | None = None
     """The keyframes of the submap; None from recipes without keyframes."""
+    matched: Bool[Array, " m"] | None = None
+    """True for ``points`` whose distance from the map counted in the match; None unless
+    ``config.registration.mark_matched`` is true."""
     smoother_unfinished: Bool[Array, ""] | None = None
     """The match converged, and the smoother reached its largest number of linearisations; None from recipes
     without one."""
@@ -304,6 +307,11 @@ class Recipe(ABC, Generic[C, P, S]):
     recipe is without samples. A recipe that carries rate and velocity on by itself does better without."""
     given_values: ClassVar[Mapping[str, Any]] = {}
     """Values by path in which the recipe differs from the defaults of the back end and of the runner."""
+
+    @property
+    def compensates(self) -> bool:
+        """Return whether the motion within a sweep is compensated."""
+        return self.needs.point_times
 
     @abstractmethod
     def init(self, params: P, imu: ImuBatch | None = None) -> S:

@@ -19,6 +19,7 @@ from lio_jax.registration.lines_and_planes import (
     FittedTo,
     LinesAndPlanes,
     Weights,
+    counted,
     huber,
     linearise,
     lines_near,
@@ -56,6 +57,10 @@ class FeatureMatch(ScanMatch[FeaturePoints, LinesAndPlanes]):
         points, range_sigma = self.points_at(T_world_lidar), self.lidar.range_sigma
         settings = self.frames(), self.weights(), range_sigma, self.fitted_to(found)
         return linearise(found, points, T_world_lidar, *settings)
+
+    def counted(self, T_world_lidar: jaxlie.SE3, found: LinesAndPlanes) -> Bool[Array, " k"]:
+        points = self.points_at(T_world_lidar)
+        return counted(found, points, T_world_lidar, self.frames(), self.weights())
 
 
 class ScanToFeatures(FeatureMatch):

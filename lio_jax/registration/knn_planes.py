@@ -10,7 +10,7 @@ import jaxlie
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int32
 
-from lio_jax.core.geometry import eigenvalues_and_normal3, normal_slope3
+from lio_jax.core.geometry import dot3, eigenvalues_and_normal3, normal_slope3
 from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.xla import computed_once
 from lio_jax.lidar.params import LidarParams
@@ -351,6 +351,13 @@ class ScanToPoints(ScanMatch[Array, FittedPlanes]):
         points, frame = self.points_at(T_world_lidar), self.frame()
         at = fitted_to(self.map, found, frame.anchor, self.map_params.voxel_size)
         return linearise(found, points, T_world_lidar, frame, self.knn, self.lidar, at)
+
+    def counted(self, T_world_lidar: jaxlie.SE3, found: FittedPlanes) -> Bool[Array, " k"]:
+        points = jnp.where(found.valid[:, None], self.points_at(T_world_lidar), 0.0)
+        arm, placed = self.frame().place(points, T_world_lidar)
+        distance = jnp.abs(dot3(found.normal, placed) + found.offset)
+        score = match_score(distance, dot3(arm, arm), self.knn.distance_weight)
+        return found.valid & (score > self.knn.min_score.astype(points.dtype))
 
     def frame(self) -> Frame:
         """Return the frame of the matches."""

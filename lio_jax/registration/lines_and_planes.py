@@ -299,6 +299,25 @@ def linearise(
     )
 
 
+def counted(
+    matches: LinesAndPlanes,
+    points: FeaturePoints,
+    T_world_lidar: jaxlie.SE3,
+    frames: Frames,
+    weights: Weights,
+) -> Bool[Array, " k"]:
+    """Return which points have a weight in :func:`linearise`, corners first; arguments as there."""
+    lines, planes = matches.lines, matches.planes
+    first = _Rows.of(lines.first, points.corner, T_world_lidar, frames.corner)
+    second = _Rows.of(lines.second, points.corner, T_world_lidar, frames.corner)
+    surface = _Rows.of(planes, points.surface, T_world_lidar, frames.surface)
+    scales = weights.scales.astype(points.surface.dtype)
+    squared = first.distance**2 + second.distance**2
+    at_corner = lines.first.valid & (weights.corner(scales, squared, first.range_squared) > 0)
+    at_surface = planes.valid & (weights.surface(scales, surface.distance**2, surface.range_squared) > 0)
+    return jnp.concatenate([at_corner, at_surface])
+
+
 class _Rows(eqx.Module):
     """Distances of points from planes, and their derivatives."""
 

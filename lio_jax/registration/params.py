@@ -118,6 +118,9 @@ class RegistrationConfig:
 
     max_iterations: int = static(60, above=0)
     """Largest number of Gauss-Newton steps, or of filter updates."""
+    mark_matched: bool = static(False)
+    """State in the output which points were matched. With ``config.output.clouds``, a run then writes these
+    as well."""
 
 
 @dataclass(frozen=True)

@@ -166,6 +166,15 @@ class ScanMatch(eqx.Module, Generic[_Points, _Found]):
             iteration: how many linearisations went before: a robust kernel may narrow with it.
         """
 
+    @abc.abstractmethod
+    def counted(self, T_world_lidar: jaxlie.SE3, found: _Found) -> Bool[Array, " k"]:
+        """Return which of :meth:`together`'s points have a distance that counts at a pose.
+
+        Args:
+            T_world_lidar: the solution.
+            found: what the points are associated with.
+        """
+
     def settled(self, iteration: Int32[Array, ""]) -> Bool[Array, ""]:
         """Return whether the robust kernel has its own scale, so that the solve may end."""
         return jnp.array(True)

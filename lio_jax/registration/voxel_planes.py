@@ -404,6 +404,9 @@ class ScanToVoxels(ScanMatch[Array, Matches]):
         coordinates = found.coordinates_in(self.map)
         return linearise(found, points, T_world_lidar, self.frame(), kernel, self.lidar, coordinates)
 
+    def counted(self, T_world_lidar: jaxlie.SE3, found: Matches) -> Bool[Array, " k"]:
+        return found.used
+
     def settled(self, iteration: Int32[Array, ""]) -> Bool[Array, ""]:
         return self.opening(iteration) <= self.registration.kernel
 

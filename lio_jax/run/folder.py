@@ -16,6 +16,7 @@ from lio_jax.core.errors import UsageError
 from lio_jax.core.files import atomic_path, folder_lock, remove_leftovers
 from lio_jax.run.keyframes import remove_keyframes
 from lio_jax.run.map_file import SPOOL_SUFFIX, TILES_PREFIX
+from lio_jax.run.scan_clouds import remove_clouds
 from lio_jax.run.unfinished import CONFIG, MARK, TRAJECTORY, read_unfinished, remove_journal, remove_mark
 
 _LIBRARIES = ("lio-jax", "jax", "jaxlib", "numpy", "scipy")
@@ -77,7 +78,7 @@ RUN_FILES = (
     "timings.png",
     "report.html",
 )
-"""Files that a run may write, besides its keyframes."""
+"""Files that a run may write, besides its keyframes and clouds."""
 
 _SPOOL = f"map{SPOOL_SUFFIX}"
 
@@ -123,6 +124,7 @@ def _make_empty(path: Path, overwrite: bool, resume: bool) -> None:
     for tiles in path.glob(f"{TILES_PREFIX}*"):
         shutil.rmtree(tiles, ignore_errors=True)
     remove_keyframes(path, unfinished_only=True)
+    remove_clouds(path, unfinished_only=True)
     begun = None if overwrite else read_unfinished(path)
     if begun is not None and not resume:
         raise UsageError(
@@ -138,6 +140,8 @@ def _make_empty(path: Path, overwrite: bool, resume: bool) -> None:
         if begun is None or name not in (CONFIG, TRAJECTORY):
             (path / name).unlink(missing_ok=True)
     remove_keyframes(path)
+    # an unfinished run writes them again: its last file may hold only a part of its scans
+    remove_clouds(path)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +26,19 @@ def check_ending(path: Path) -> None:
         raise UsageError(f"{path}: a map's name ends in {' or '.join(CLOUD_ENDINGS)}; choose one of them.")
 
 
-def write_cloud(path: Path, parts: Iterable[NDArray[np.float32]], count: int) -> None:
+XYZ = ("x", "y", "z")
+
+
+def write_cloud(
+    path: Path, parts: Iterable[NDArray[np.float32]], count: int, fields: tuple[str, ...] = XYZ
+) -> None:
     """Write points, complete or not at all, in binary: PCD or PLY (little endian), by the file's ending.
 
     Args:
         path: path of the file.
-        parts: arrays (n, 3) of points, m; they are taken one by one.
+        parts: arrays (n, k) with a column for each field, coordinates in m; they are taken one by one.
         count: total number of points in the parts; both formats state it first.
+        fields: names of the k columns.
 
     Raises:
         UsageError: the file has another ending.
@@ -40,7 +46,7 @@ def write_cloud(path: Path, parts: Iterable[NDArray[np.float32]], count: int) ->
     """
     check_ending(path)
     with atomic_path(path) as aside, aside.open("wb") as file:
-        file.write((_ply_header if path.suffix.lower() == ".ply" else _pcd_header)(count))
+        file.write((_ply_header if path.suffix.lower() == ".ply" else _pcd_header)(count, fields))
         written = sum(_append(file, part) for part in parts)
         if written != count:
             raise ValueError(f"{written} points came where {count} were announced")
@@ -66,23 +72,24 @@ def _append(file: BinaryIO, points: NDArray[np.float32]) -> int:
     return len(points)
 
 
-def _pcd_header(count: int) -> bytes:
+def _pcd_header(count: int, fields: tuple[str, ...]) -> bytes:
     from pypcd4 import Encoding, MetaData
 
-    xyz = MetaData(
-        fields=("x", "y", "z"),
-        size=(4, 4, 4),
-        type=("F", "F", "F"),
-        count=(1, 1, 1),
+    kind: Literal["F"] = "F"
+    described = MetaData(
+        fields=fields,
+        size=(4,) * len(fields),
+        type=(kind,) * len(fields),
+        count=(1,) * len(fields),
         points=count,
         width=count,
     )
-    return xyz.compose_header(Encoding.BINARY).encode()
+    return described.compose_header(Encoding.BINARY).encode()
 
 
-def _ply_header(count: int) -> bytes:
+def _ply_header(count: int, fields: tuple[str, ...]) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [f"property float {axis}" for axis in "xyz"]
+    lines += [f"property float {name}" for name in fields]
     return "\n".join([*lines, "end_header", ""]).encode()
 
 

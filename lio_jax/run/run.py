@@ -29,6 +29,7 @@ from lio_jax.run.journal import Journal
 from lio_jax.run.localise import LocalisingStep, step_of
 from lio_jax.run.logs import Failures, Overflow, ScanLog, StageTimes, TrajectoryLog
 from lio_jax.run.map_file import MapFile
+from lio_jax.run.scan_clouds import ScanClouds
 from lio_jax.run.scan_inputs import ImuFeed, feed_of
 from lio_jax.run.set_up_check import SetUpCheck
 from lio_jax.run.sinks import RunResult, Sink, finish_all
@@ -120,7 +121,7 @@ def run_sequence(
         everyone: list[Sink] = [times, Overflow(settings), Failures(start)]
         everyone += [SetUpCheck(settings, imu.samples if imu else None, notify), Verdict(settings)]
         everyone += [ScanLog(out / "scans.npz", start), log]
-        for sink in _result_files(sequence, settings, out, imu, log, feedback):
+        for sink in _result_files(sequence, settings, out, start, imu, log, feedback):
             stack.callback(sink.close)
             everyone.append(sink)
         everyone += sinks
@@ -173,6 +174,7 @@ def _result_files(
     sequence: Sequence,
     settings: Settings,
     out: Path,
+    start: int,
     imu: ImuFeed | None,
     log: TrajectoryLog,
     feedback: Feedback | None,
@@ -184,6 +186,8 @@ def _result_files(
         yield GlobalCorrection(sequence, settings, out, files, feedback)
     elif settings.run.output.map:
         yield MapFile(out / "map.pcd")
+    if settings.run.output.clouds != "none":
+        yield ScanClouds(out, settings, start)
     if imu and imu.samples:
         yield ImuRateFile(out / "imu_rate.tum", imu.samples, log)
 

@@ -69,6 +69,8 @@ class ScanResult:
     T_map_odom: NDArray[np.float64] | None = None
     """(4, 4) pose of the odometry's world in the corrected map that the scan was matched with, m; None
     without feedback."""
+    fed: ScanInput | None = None
+    """The scan as the step took it, with all its points; None where ``config.output.clouds`` is "none"."""
 
 
 class Compiled:
@@ -280,6 +282,7 @@ class ResultBuilder:
             outage=self._outages(fed.end_ns, evidence, output.covariance),
             raw=_some(np.asarray(fed.scan.points)[: fed.count]),
             T_map_odom=T_map_odom,
+            fed=None if self._settings.run.output.clouds == "none" else fed,
         )
 
 

@@ -27,6 +27,7 @@ _UNITS = ("s", "ms", "us", "ns")
 _LIVOX = 1
 _ESTIMATED = ("params.initial.extrinsic_rotation_sigma", "params.initial.extrinsic_translation_sigma")
 _OUTPUT = "chooses what its node publishes or saves; a run writes a folder"
+_PUBLISHED = "a run publishes nothing; config.output.clouds=all (dense) or thinned writes a scan's points"
 
 
 def _density(value: Any, place: str) -> float:
@@ -62,6 +63,18 @@ def _updates(value: Any, place: str) -> int:
     return whole_number(value, place) + 1
 
 
+def _saved(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    if not flag(value, place):
+        return {"config.output.clouds": "none"}, ""
+    word = "all points whatever dense_publish_en says, as there; those between every n-th are not left out"
+    return {"config.output.clouds": "all"}, word
+
+
+def _scans_per_file(value: Any, place: str) -> int:
+    interval = whole_number(value, place)
+    return interval if interval > 0 else 0
+
+
 def _estimated(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
     if flag(value, place):
         own = numbers_of(FastLio2Params)["initial"]
@@ -78,7 +91,9 @@ FAST_LIO2 = System(
     rules={
         "lid_topic": same("config.data.lidar_topic"),
         "imu_topic": same("config.data.imu_topic"),
-        "time_sync_en": nothing("stamps are taken as they are; params.extrinsics.time_offset shifts them"),
+        "time_sync_en": converted(
+            "config.data.align_clocks", by=flag, word="only clocks that differ by more than 1 s, as there"
+        ),
         "time_offset_lidar_to_imu": same("params.extrinsics.time_offset", word="the same sign"),
         "lidar_type": nothing("recognised from the messages"),
         "scan_line": nothing("rings are read or reconstructed from the points"),
@@ -118,6 +133,10 @@ FAST_LIO2 = System(
         ),
         "runtime_pos_log_enable": nothing(_OUTPUT),
         "map_file_path": nothing(_OUTPUT),
+        "pcd_save_en": Rule(_saved),
+        "interval": converted(
+            "config.output.clouds_interval", by=_scans_per_file, word="0 for its -1: all scans in one file"
+        ),
     },
-    other_sections={"publish": nothing(_OUTPUT), "pcd_save": nothing(_OUTPUT)},
+    other_sections={"publish": nothing(_PUBLISHED)},
 )

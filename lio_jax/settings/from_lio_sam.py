@@ -69,6 +69,14 @@ def _sensor(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str
     return {"config.features.order": order}, word
 
 
+def _leaf_size(path: str) -> Rule:
+    def take(value: Any, place: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+        word = "each leaf of the submap holds the mean of its points, as VoxelGrid leaves it"
+        return {path: value, "config.lio_sam.map_points": "mean"}, word
+
+    return Rule(take, method=True, paths=(path,))
+
+
 def _of_method(path: str, word: str = "") -> Rule:
     return same(path, word=word, method=True)
 
@@ -109,8 +117,8 @@ LIO_SAM = System(
         "edgeFeatureMinValidNum": _of_method("params.submap.min_corners"),
         "surfFeatureMinValidNum": _of_method("params.submap.min_surfaces"),
         "odometrySurfLeafSize": _of_method("params.features.surface_spacing"),
-        "mappingCornerLeafSize": _of_method("params.map.corner_voxel_size"),
-        "mappingSurfLeafSize": _of_method("params.map.voxel_size"),
+        "mappingCornerLeafSize": _leaf_size("params.map.corner_voxel_size"),
+        "mappingSurfLeafSize": _leaf_size("params.map.voxel_size"),
         "z_tollerance": _of_method("params.smoother.height_limit"),
         "rotation_tollerance": _of_method("params.smoother.tilt_limit"),
         "numberOfCores": nothing("the machine's cores are used as JAX finds them"),

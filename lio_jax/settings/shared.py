@@ -1,6 +1,7 @@
 """Settings that every run has beside those of its recipe: reading, the back end, a known map, output."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import equinox as eqx
 
@@ -29,6 +30,11 @@ class OutputConfig:
     """Write trajectory.png and timings.png."""
     report: bool = static(True)
     """Write report.html."""
+    clouds: Literal["none", "thinned", "all"] = static("none")
+    """Write the motion-compensated points of the scans in world into clouds/: those that the recipe adds to
+    its map or matches, or all points within the range limits."""
+    clouds_interval: int = static(1, least=0)
+    """Number of scans per file in clouds/. 0 writes all scans into one file."""
     keyframe_distance: float = static(1.0, "m", above=0)
     """A scan this far from the last keyframe becomes a keyframe of the run folder and of the back end."""
     keyframe_angle: float = static(0.2, "rad", above=0)

@@ -9,7 +9,15 @@ import pytest
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data.rosbag import RosbagSequence
 from tests.data import bags
-from tests.data.bag_recordings import AUTO, SEEN, cloud_messages, received, scan_starts
+from tests.data.bag_recordings import (
+    AUTO,
+    SEEN,
+    cloud_messages,
+    imu_messages,
+    in_order,
+    received,
+    scan_starts,
+)
 
 
 def test_duplicate_and_backward_stamps_are_left_out(tmp_path: Path) -> None:
@@ -66,3 +74,42 @@ def test_times_can_be_overridden(tmp_path: Path) -> None:
     assert first.end_ns == pytest.approx(bags.START_NS, abs=2)
     with pytest.raises(LioJaxError, match=r"a.bag: topic /points: config.data.time_field='t' is not a field"):
         RosbagSequence(path, replace(AUTO, time_field="t"))
+
+
+def _with_imu_clock(path: Path, difference_ns: int) -> Path:
+    """Write a bag whose IMU's stamps are late or early, although its messages arrive with the scans."""
+    ros2 = bags.is_ros2(path)
+    samples = [
+        (topic, stamp, bags.imu_message(stamp + difference_ns, ros2, accel=(0.0, 0.0, 9.8)))
+        for topic, stamp, _ in imu_messages(100, ros2)
+    ]
+    clouds = cloud_messages(path, [bags.fill(bags.VELODYNE, SEEN, SEEN.time)] * 8)
+    return bags.write_bag(path, in_order(clouds + samples))
+
+
+@pytest.mark.parametrize("difference_s", [-1.7e9, -2.5, 40.0])
+@pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
+def test_clocks_that_differ_by_more_than_a_second_are_aligned_if_asked_for(
+    tmp_path: Path, name: str, difference_s: float
+) -> None:
+    difference = int(difference_s * 1e9)
+    path = _with_imu_clock(tmp_path / name, difference)
+    as_they_are = RosbagSequence(path, AUTO).imu()
+    aligned = RosbagSequence(path, replace(AUTO, align_clocks=True))
+    imu = aligned.imu()
+    assert as_they_are is not None
+    assert imu is not None
+    assert as_they_are.stamp_ns[0] == bags.START_NS + difference
+    # a scan is received 3 ms after its end, and a sample every 10 ms
+    assert abs(imu.stamp_ns[0] - bags.START_NS) < 15_000_000
+    np.testing.assert_array_equal(np.diff(imu.stamp_ns), np.diff(as_they_are.stamp_ns))
+    assert any("were added to its stamps, to align the clocks" in note for note in aligned.info.notes)
+
+
+def test_clocks_that_differ_by_less_stay_as_they_are(tmp_path: Path) -> None:
+    path = _with_imu_clock(tmp_path / "a.bag", 900_000_000)
+    sequence = RosbagSequence(path, replace(AUTO, align_clocks=True))
+    imu = sequence.imu()
+    assert imu is not None
+    assert imu.stamp_ns[0] == bags.START_NS + 900_000_000
+    assert not any("clocks" in note for note in sequence.info.notes)

@@ -253,3 +253,37 @@ def test_a_file_that_is_not_there_or_not_text(tmp_path):
     (tmp_path / "bytes.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UsageError, match="is not a text file"):
         load_foreign_settings(tmp_path / "bytes.yaml")
+
+
+@pytest.mark.parametrize(
+    ("saved", "interval", "clouds", "scans"),
+    [(True, -1, "all", 0), (True, 10, "all", 10), (True, 0, "all", 0), (False, 5, "none", 5)],
+)
+def test_fast_lio2s_saved_clouds_are_the_runs(saved, interval, clouds, scans):
+    values = yaml.safe_load(fast_lio2(max_iteration=3))
+    values |= {"pcd_save": {"pcd_save_en": saved, "interval": interval}}
+    # what is published there does not choose what is saved
+    values |= {"publish": {"scan_publish_en": not saved, "dense_publish_en": False}}
+    for recipe in ("fast_lio2", "default"):
+        output = resolved(yaml.safe_dump(values), recipe).run.output
+        assert (output.clouds, output.clouds_interval) == (clouds, scans)
+
+
+def test_wrong_values_of_the_saved_clouds_are_named():
+    values = yaml.safe_load(fast_lio2(max_iteration=3))
+    with pytest.raises(UsageError, match=r"theirs\.yaml: pcd_save\.pcd_save_en = 1 must be true or false\."):
+        read(yaml.safe_dump(values | {"pcd_save": {"pcd_save_en": 1}}))
+    with pytest.raises(UsageError, match=r"pcd_save\.interval = 1\.5 must be a whole number\."):
+        read(yaml.safe_dump(values | {"pcd_save": {"interval": 1.5}}))
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_fast_lio2s_clock_alignment_is_the_readers(wanted):
+    values = yaml.safe_load(fast_lio2(max_iteration=3))
+    values["common"]["time_sync_en"] = wanted
+    assert resolved(yaml.safe_dump(values)).run.data.align_clocks is wanted
+
+
+@pytest.mark.parametrize("key", ["mappingCornerLeafSize", "mappingSurfLeafSize"])
+def test_a_lio_sam_file_asks_for_the_means_of_voxel_grid(key):
+    assert resolved(lio_sam(N_SCAN=16, **{key: 0.3})).config.lio_sam.map_points == "mean"
