@@ -1,0 +1,210 @@
+"""Read packet captures of Ouster lidars, with the IMU in them, by the vendor's library ouster-sdk."""
+
+import os
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lio_jax.core.errors import LioJaxError, one_line
+from lio_jax.data.config import DataConfig
+from lio_jax.data.pcap_file import SUFFIXES, datagrams, unknown_capture
+from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
+from lio_jax.data.time_order import Stamped, in_time_order
+
+INSTALL = "pip install --no-deps ouster-sdk"
+"""Command that installs the library. Its own dependencies contradict ours; reading captures needs none of them."""
+
+_VALID = 1
+"""Bit of the status of a column that was measured."""
+_INTENSITY = ("SIGNAL", "REFLECTIVITY")
+"""Fields that are read as intensity; the first one that the sensor sends."""
+
+
+class OusterPcap:
+    """A capture of one Ouster, with the file of its metadata beside it."""
+
+    def __init__(self, path: Path, config: DataConfig) -> None:
+        """Find the metadata and the frames.
+
+        Args:
+            path: path of the capture.
+            config: not used, because packets and metadata state everything.
+
+        Raises:
+            LioJaxError: the capture holds no frames of the sensor that the metadata describe, there are no
+                metadata, or the library is not installed.
+        """
+        self._path = path
+        self._log = WarningLog()
+        # the library ends silently where a capture is truncated, and reads nothing of what is no capture
+        if not any(True for _ in datagrams(path, self._log.add)):
+            raise unknown_capture(path)
+        described = _metadata_files(path)
+        if not described:
+            raise unknown_capture(
+                path,
+                f" (an Ouster needs its metadata, a .json file, in the folder {path.parent}; ouster-cli and "
+                "Ouster Studio write it beside the capture)",
+            )
+        self._sdk = _library(path)
+        self._metadata, self._sensor = self._described(described)
+        self._frames = self._opened()
+        self._project = self._sdk.core.XYZLut(self._sensor, use_extrinsics=False)
+        self.info = SequenceInfo(
+            name=path.stem,
+            format="ouster_pcap",
+            path=str(path),
+            scan_count=len(self._frames),
+            T_imu_lidar=_inverse(_in_metres(self._sensor.imu_to_sensor_transform)),
+            sensor=f"Ouster {self._sensor.prod_line}",
+            notes=(
+                f"packets of an Ouster {self._sensor.prod_line}, with the metadata of {self._metadata.name}",
+                "points in the sensor's frame; T_imu_lidar is that of the metadata",
+            ),
+        )
+
+    @property
+    def warnings_so_far(self) -> tuple[str, ...]:
+        """Return one sentence for each problem met up to now."""
+        return self._log.sentences
+
+    def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
+        """Yield frames ``start`` to ``start + count``; one with a wrong stamp is left out with a warning."""
+        yield from in_time_order(self._scans(start, count), self._log.add)
+
+    def imu(self) -> ImuData | None:
+        """Return the samples of the sensor's own IMU, or None where none were recorded."""
+        return self._imu
+
+    def gps(self) -> GpsData | None:
+        """Return None: fixes in a capture have no height."""
+        return None
+
+    def truth(self) -> None:
+        """Return None: a capture states no ground truth."""
+
+    def _scans(self, start: int, count: int | None) -> Iterator[Stamped[LidarScan]]:
+        stop = len(self._frames) if count is None else min(start + count, len(self._frames))
+        if start >= stop:
+            return
+        # frames share one reader, so each pass needs its own
+        for number, frames in enumerate(self._opened()[start:stop], start):
+            name = f"{self._path.name}: scan {number}"
+            scan = None if frames[0] is None else self._scan(frames[0])
+            if scan is None:
+                self._log.add(f"{name} holds no measured column and was skipped.")
+                continue
+            yield Stamped(scan.stamp_ns, name, scan)
+
+    def _scan(self, frame: Any) -> LidarScan | None:
+        measured = np.flatnonzero(frame.status & _VALID)
+        if not len(measured):
+            return None
+        stamps = frame.timestamp[measured].astype(np.int64)
+        start_ns = int(stamps.min())
+        # the frame lasts until the next column would be measured
+        columns = max(int(measured[-1] - measured[0]), 1)
+        duration_ns = int(stamps.max()) - start_ns
+        duration_ns += duration_ns // columns
+        ranges = frame.field("RANGE")[:, measured]
+        intensity = next((frame.field(name) for name in _INTENSITY if name in frame.fields), ranges)
+        # column by column, as the sensor fires
+        column, ring = np.nonzero(ranges.T)
+        at = measured[column]
+        return LidarScan(
+            stamp_ns=start_ns,
+            points=self._project(frame)[ring, at].astype(np.float32),
+            time=((stamps - start_ns) * 1e-9).astype(np.float32)[column],
+            ring=ring.astype(np.int32),
+            intensity=intensity[ring, at].astype(np.float32),
+            duration=duration_ns * 1e-9,
+            dropped=ranges.size - len(ring),
+        )
+
+    @cached_property
+    def _imu(self) -> ImuData | None:
+        stamps, gyro, accel = [], [], []
+        packets = self._sdk.open_packet_source(str(self._path), meta=[str(self._metadata)])
+        for _, packet in packets:
+            if isinstance(packet, self._sdk.core.ImuPacket):
+                # the library gives rad/s and m/s^2
+                stamps.append(packet.timestamp())
+                gyro.append(packet.gyro())
+                accel.append(packet.accel())
+        if not stamps:
+            return None
+        return ImuData(
+            np.concatenate(stamps).astype(np.int64),
+            np.concatenate(gyro).astype(np.float64),
+            np.concatenate(accel).astype(np.float64),
+        )
+
+    def _described(self, files: list[Path]) -> tuple[Path, Any]:
+        """Return the first file of metadata that can be read, and what it describes."""
+        failed = ""
+        for file in files:
+            try:
+                return file, self._sdk.core.SensorInfo(file.read_text(encoding="utf-8"))
+            # the library raises exceptions of many kinds on other files
+            except Exception as error:
+                failed = failed or f"{file}: is no metadata of an Ouster ({one_line(str(error))})"
+        raise LioJaxError(f"{failed}; put the metadata of {self._path.name} in its place.")
+
+    def _opened(self) -> Any:
+        try:
+            frames = self._sdk.open_source(
+                str(self._path), meta=[str(self._metadata)], sensor_idx=0, collate=False, index=True
+            )
+        except Exception as error:
+            raise LioJaxError(
+                f"{self._path}: cannot be read with the metadata of {self._metadata.name} "
+                f"({one_line(str(error))}); check that they belong together."
+            ) from None
+        if not len(frames):
+            raise unknown_capture(
+                self._path, f", or {self._metadata.name} is the metadata of another sensor"
+            )
+        return frames
+
+
+def _metadata_files(path: Path) -> list[Path]:
+    """Return the .json files beside a capture, the one with the most similar name first."""
+    found = (file for file in path.parent.glob("*.json") if file.is_file())
+    return sorted(found, key=lambda file: (-len(os.path.commonprefix([file.stem, path.stem])), file.name))
+
+
+def _in_metres(transform: NDArray[np.float64]) -> NDArray[np.float64]:
+    scaled = np.array(transform, np.float64)
+    scaled[:3, 3] *= 1e-3
+    return scaled
+
+
+def _inverse(transform: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.linalg.inv(transform), np.float64)
+
+
+def _library(path: Path) -> Any:
+    try:
+        from ouster import sdk
+        from ouster.sdk import core  # noqa: F401
+    except ImportError:
+        raise LioJaxError(
+            f"{path}: captures of an Ouster are decoded by ouster-sdk, which is not installed; install it with "
+            f"{INSTALL}."
+        ) from None
+    return sdk
+
+
+READER = Reader(
+    "ouster_pcap",
+    "a packet capture of an Ouster (.pcap with its metadata .json)",
+    lambda path: path.is_file() and path.suffix.lower() in SUFFIXES,
+    OusterPcap,
+    reads=frozenset(),
+    has_parts=False,
+)
+"""It takes every capture that no reader before it takes, and says what is wrong with one of another sensor."""
