@@ -4,7 +4,16 @@ from dataclasses import fields
 from pathlib import Path
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data import clouds, evalio_sequences, kitti, kitti_raw, native, ouster_pcap, rosbag, velodyne_pcap
+from lio_jax.data import (
+    clouds,
+    evalio_sequences,
+    kitti,
+    kitti_raw,
+    native,
+    ouster_pcap,
+    rosbag,
+    velodyne_pcap,
+)
 from lio_jax.data.config import DataConfig
 from lio_jax.data.sequence import Reader, Sequence, entries
 

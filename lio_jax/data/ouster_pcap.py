@@ -1,6 +1,5 @@
 """Read packet captures of Ouster lidars, with the IMU in them, by the vendor's library ouster-sdk."""
 
-import os
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +15,7 @@ from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceI
 from lio_jax.data.time_order import Stamped, in_time_order
 
 INSTALL = "pip install --no-deps ouster-sdk"
-"""Command that installs the library. Its own dependencies contradict ours; reading captures needs none of them."""
+"""Command that installs the library: its dependencies contradict ours, and captures are read without them."""
 
 _VALID = 1
 """Bit of the status of a column that was measured."""
@@ -40,8 +39,8 @@ class OusterPcap:
         """
         self._path = path
         self._log = WarningLog()
-        # the library ends silently where a capture is truncated, and reads nothing of what is no capture
-        if not any(True for _ in datagrams(path, self._log.add)):
+        # the library says nothing of a capture that is truncated, damaged or none at all
+        if not sum(1 for _ in datagrams(path, self._log.add)):
             raise unknown_capture(path)
         described = _metadata_files(path)
         if not described:
@@ -165,16 +164,19 @@ class OusterPcap:
                 f"({one_line(str(error))}); check that they belong together."
             ) from None
         if not len(frames):
-            raise unknown_capture(
-                self._path, f", or {self._metadata.name} is the metadata of another sensor"
-            )
+            raise unknown_capture(self._path, f", or {self._metadata.name} is the metadata of another sensor")
         return frames
 
 
 def _metadata_files(path: Path) -> list[Path]:
     """Return the .json files beside a capture, the one with the most similar name first."""
     found = (file for file in path.parent.glob("*.json") if file.is_file())
-    return sorted(found, key=lambda file: (-len(os.path.commonprefix([file.stem, path.stem])), file.name))
+    return sorted(found, key=lambda file: (-_equal_letters(file.stem, path.stem), file.name))
+
+
+def _equal_letters(one: str, other: str) -> int:
+    """Return the number of letters with which both names begin."""
+    return next((place for place, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), len(one))
 
 
 def _in_metres(transform: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -193,8 +195,8 @@ def _library(path: Path) -> Any:
         from ouster.sdk import core  # noqa: F401
     except ImportError:
         raise LioJaxError(
-            f"{path}: captures of an Ouster are decoded by ouster-sdk, which is not installed; install it with "
-            f"{INSTALL}."
+            f"{path}: captures of an Ouster are decoded by ouster-sdk, which is not installed; install it "
+            f"with {INSTALL}."
         ) from None
     return sdk
 
@@ -207,4 +209,4 @@ READER = Reader(
     reads=frozenset(),
     has_parts=False,
 )
-"""It takes every capture that no reader before it takes, and says what is wrong with one of another sensor."""
+"""It takes every capture that no reader before it takes, and names what is wrong with that."""

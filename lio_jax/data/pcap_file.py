@@ -71,7 +71,9 @@ def datagrams(path: Path, warn: Callable[[str], None], place: int = 0) -> Iterat
         with path.open("rb", buffering=_BUFFER) as file:
             yield from _datagrams(file, path, warn, place)
     except OSError as error:
-        raise LioJaxError(f"{path}: cannot be read ({error.strerror}); check the file and the disk.") from None
+        raise LioJaxError(
+            f"{path}: cannot be read ({error.strerror}); check the file and the disk."
+        ) from None
 
 
 def first_datagrams(path: Path) -> list[Datagram]:
@@ -100,13 +102,13 @@ def unknown_capture(path: Path, advice: str = "") -> LioJaxError:
     cut = [one for one in seen if (one.port, one.length) == (port, length) and len(one.data) < length]
     if len(cut) == count and max(len(one.data) for one in cut) < _SHORTEST_FRAGMENT:
         return LioJaxError(
-            f"{path}: its packets were cut to {max(len(one.data) for one in cut)} of {length} bytes when they "
-            "were recorded; record them whole (tcpdump -s 0)."
+            f"{path}: its packets were cut to {max(len(one.data) for one in cut)} of {length} bytes when "
+            "they were recorded; record them whole (tcpdump -s 0)."
         )
     return LioJaxError(
-        f"{path}: most of its UDP packets hold {length} bytes and go to port {port}: they are not those of a "
-        f"Velodyne or of an Ouster with its metadata{advice}; if another lidar sent them, let its driver write "
-        "a ROS bag of them, and give that."
+        f"{path}: most of its UDP packets hold {length} bytes and go to port {port}: they are not those of "
+        f"a Velodyne or of an Ouster with its metadata{advice}; if another lidar sent them, let its driver "
+        "write a ROS bag of them, and give that."
     )
 
 
@@ -127,9 +129,7 @@ def _datagrams(file: BinaryIO, path: Path, warn: Callable[[str], None], place: i
             return
         seconds, fraction, kept, _ = record.unpack(header)
         if kept > _LARGEST:
-            warn(
-                f"{path}: damaged at byte {place} (a packet of {kept} bytes): the packets before that are used."
-            )
+            warn(f"{path}: damaged at byte {place} (a packet of {kept} bytes): what is before that is used.")
             return
         frame = file.read(kept)
         if len(frame) < kept:
@@ -158,8 +158,8 @@ def _file_header(file: BinaryIO, path: Path) -> tuple[str, int, int]:
             link = struct.unpack(order + "I", header[20:])[0] & 0xFFFF
             if link not in _IP_AT and link not in _TYPE_AT:
                 raise LioJaxError(
-                    f"{path}: was recorded on a link of type {link}, which is not read; record the packets on "
-                    "an Ethernet interface."
+                    f"{path}: was recorded on a link of type {link}, which is not read; record the packets "
+                    "on an Ethernet interface."
                 )
             return order, _TICK_NS[number], link
     raise LioJaxError(

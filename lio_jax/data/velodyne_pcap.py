@@ -1,4 +1,4 @@
-"""Read packet captures of Velodyne lidars, whose packets the library velodyne-decoder decodes (extra ``pcap``).
+"""Read packet captures of Velodyne lidars by the library velodyne-decoder (extra ``pcap``).
 
 Packets: Velodyne, "VLP-16 User Manual" (63-9243), section 9. Every model sends 12 blocks of 100 bytes, each
 with a flag and an azimuth, and then the time since the top of the hour.
@@ -101,7 +101,7 @@ class VelodynePcap:
         return self._log.sentences
 
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
-        """Yield scans ``start`` to ``start + count``; a turn with a wrong stamp is left out with a warning."""
+        """Yield scans ``start`` to ``start + count``; one with a wrong stamp is left out with a warning."""
         yield from in_time_order(self._scans(start, count), self._log.add)
 
     def imu(self) -> ImuData | None:
@@ -238,7 +238,7 @@ def _microseconds(packet: Datagram) -> int:
 
 
 def _nearest_ns(packet: Datagram, lag_ns: int) -> tuple[int, int]:
-    """Return a packet's time with the hour that the computer's clock states, and the delay of its receipt, ns.
+    """Return a packet's time, in the hour that the computer's clock states, and the delay of receipt, ns.
 
     Args:
         packet: a packet of the sensor.
@@ -261,8 +261,8 @@ def _library(path: Path) -> Any:
         import velodyne_decoder
     except ImportError:
         raise LioJaxError(
-            f"{path}: captures of a Velodyne are decoded by velodyne-decoder, which is not installed; install "
-            "it with pip install 'lio-jax[pcap]'."
+            f"{path}: captures of a Velodyne are decoded by velodyne-decoder, which is not installed; "
+            "install it with pip install 'lio-jax[pcap]'."
         ) from None
     return velodyne_decoder
 

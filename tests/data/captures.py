@@ -64,9 +64,7 @@ def _frames(one: Sent, number: int, link: int, vlan: bool, mtu: int) -> list[byt
     for at in range(0, len(content), size):
         part = content[at : at + size]
         more = 0x2000 * (at + size < len(content))
-        header = struct.pack(
-            ">BBHHHBBH", 0x45, 0, 20 + len(part), number & 0xFFFF, more | at // 8, 64, 17, 0
-        )
+        header = struct.pack(">BBHHHBBH", 0x45, 0, 20 + len(part), number & 0xFFFF, more | at // 8, 64, 17, 0)
         frames.append(head + header + addresses + part)
     return frames
 
@@ -104,7 +102,8 @@ class Model:
 VLP16 = Model(
     0x22,
     np.array([-15.0, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15]),
-    np.array([11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1, 5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2]) * 1e-3,
+    np.array([11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1, 5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2])
+    * 1e-3,
     55_296,
     2_304,
 )
@@ -146,7 +145,9 @@ def packets(
     return written
 
 
-def received(written: Iterable[tuple[int, bytes]], ahead_ns: int = 0, latency_ns: int = 2_000_000) -> list[Sent]:
+def received(
+    written: Iterable[tuple[int, bytes]], ahead_ns: int = 0, latency_ns: int = 2_000_000
+) -> list[Sent]:
     """Return packets as a computer receives them whose clock is ahead of the sensor's."""
     return [Sent(time_ns + ahead_ns + latency_ns, 2368, data) for time_ns, data in written]
 
