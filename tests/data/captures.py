@@ -18,6 +18,8 @@ from lio_jax.sim.lidar import SpinningLidar
 
 HOUR_NS = 3_600_000_000_000
 ETHERNET, RAW_IP, COOKED = 1, 101, 113
+DUAL = 0x39
+"""Mode of a sensor that sends the last and the strongest return of each firing."""
 
 
 class Sent(NamedTuple):
@@ -109,7 +111,7 @@ VLP16 = Model(
 )
 HDL32E = Model(
     0x21,
-    np.stack([-30.67 + 4 / 3 * np.arange(16), -9.33 + 4 / 3 * np.arange(16)], axis=1).ravel(),
+    ((np.stack([np.arange(16), np.arange(16) + 16], axis=1).ravel() * 4 - 92) / 3).round(2),
     np.zeros(32),
     46_080,
     1_152,
@@ -128,7 +130,8 @@ def packets(
     """Return the packets of successive firings, each with the sensor's time of its first firing, ns.
 
     Args:
-        ranges: (cycles, lasers) m, a whole number of packets; 0: no return.
+        ranges: (cycles, lasers) m, a whole number of packets; 0: no return. In the mode ``DUAL`` blocks come
+            in pairs: the last return of the cycles of a block, and then their strongest return.
         azimuth: (cycles,) azimuth of the first laser of each cycle, clockwise, deg.
         start_ns: the sensor's time of the first firing, ns.
     """
@@ -140,7 +143,7 @@ def packets(
             data += struct.pack("<2sH", b"\xff\xee", round(azimuth[block] * 100) % 36000)
             for distance in ranges[block : block + per_block].ravel():
                 data += struct.pack("<HB", round(distance / 0.002), reflectivity)
-        time_ns = start_ns + first * model.cycle_ns
+        time_ns = start_ns + first * model.cycle_ns // (2 if mode == DUAL else 1)
         written.append((time_ns, data + struct.pack("<IBB", time_ns % HOUR_NS // 1000, mode, model.code)))
     return written
 
@@ -168,7 +171,7 @@ def box_ranges(model: Model, azimuth: NDArray[np.float64], half: NDArray[np.floa
     )
     origin = np.stack([0 * model.height, 0 * model.height, model.height], axis=-1)
     with np.errstate(divide="ignore"):
-        return ((np.sign(ways) * half - origin) / ways).min(axis=-1)
+        return ((np.copysign(half, ways) - origin) / ways).min(axis=-1)
 
 
 def same_timing(lidar: SpinningLidar, model: Model, columns: int) -> SpinningLidar:

@@ -1,0 +1,269 @@
+"""Captures of Velodyne lidars, written byte by byte, give back the walls of a box and the times of firing."""
+
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lio_jax.core.errors import LioJaxError
+from lio_jax.data import open_sequence
+from lio_jax.data.sequence import LidarScan
+from tests.data.captures import (
+    COOKED,
+    DUAL,
+    HDL32E,
+    HOUR_NS,
+    RAW_IP,
+    VLP16,
+    Model,
+    Sent,
+    box_ranges,
+    packets,
+    received,
+    write_pcap,
+)
+
+pytest.importorskip(
+    "velodyne_decoder", reason="velodyne-decoder is not installed; it comes with lio-jax[pcap]"
+)
+
+HALF = np.array([5.0, 4.0, 1.5])
+"""Distances of the walls, m."""
+START_NS = 1_700_000_000_000_000_000
+QUANTISED = 1.2e-3
+"""Half of the step of ranges (2 mm) and half of that of azimuths (0.01 deg), at the corners of the box, m."""
+CYCLES = 1800
+"""Firings of each laser in a turn of 0.0995 s: the azimuth's step of 0.2 deg is exact."""
+
+
+def turning(model: Model, turns: float, begin_deg: float = 0.0, cycles: int = CYCLES) -> np.ndarray:
+    number = round(turns * cycles) // model.cycles * model.cycles
+    return (begin_deg + 360 / cycles * np.arange(number)) % 360
+
+
+def box(
+    model: Model = VLP16, turns: float = 3.0, begin_deg: float = 0.0, start_ns: int = START_NS, **options: int
+) -> list[tuple[int, bytes]]:
+    """Return the packets of a sensor that stands in the box."""
+    azimuth = turning(model, turns, begin_deg)
+    return packets(model, box_ranges(model, azimuth, HALF), azimuth, start_ns, **options)
+
+
+def scans_of(path: Path) -> list[LidarScan]:
+    return list(open_sequence(path).scans())
+
+
+def wall_distance(points: np.ndarray) -> np.ndarray:
+    return np.abs(np.abs(points) - HALF).min(axis=1)
+
+
+# the library shifts the lasers of an HDL-32E by up to 17 mm of height, which its manual does not state
+@pytest.mark.parametrize(("model", "tolerance"), [(VLP16, QUANTISED), (HDL32E, 0.018)])
+def test_points_lie_on_the_walls_in_the_order_of_firing(
+    tmp_path: Path, model: Model, tolerance: float
+) -> None:
+    sequence = open_sequence(write_pcap(tmp_path / "box.pcap", received(box(model))))
+    assert (sequence.info.format, sequence.info.scan_count) == ("velodyne_pcap", 3)
+    assert sequence.info.sensor == {VLP16.code: "Velodyne VLP16", HDL32E.code: "Velodyne HDL32E"}[model.code]
+    number = 0
+    for scan in sequence.scans():
+        assert scan.points.shape == (CYCLES // model.cycles * 384, 3)
+        assert wall_distance(scan.points).max() < tolerance
+        # each firing is where the manual's tables place it
+        cycle, laser = np.divmod(np.arange(len(scan.points)), model.lasers)
+        np.testing.assert_array_equal(scan.ring, model.ring[laser])
+        expected = (cycle * model.cycle_ns + laser * model.delay_ns) * 1e-9
+        np.testing.assert_allclose(scan.time, expected, atol=2e-6)
+        elevation = np.degrees(np.arctan2(scan.points[:, 2], np.hypot(*scan.points[:, :2].T)))
+        # at 3 m the heights of the lasers change the elevation by up to a quarter of the beams' distance
+        assert np.abs(elevation - model.elevation[laser]).max() < 0.34
+        azimuth = np.degrees(-np.arctan2(scan.points[:, 1], scan.points[:, 0]))
+        head = 360 / CYCLES * (cycle + laser * model.delay_ns / model.cycle_ns)
+        assert np.abs((azimuth - head + 180) % 360 - 180).max() < 0.011
+        assert (scan.intensity == 60).all()
+        # 75 packets of a turn of the VLP-16; stamps in whole us
+        assert abs(scan.stamp_ns - START_NS - number * CYCLES * model.cycle_ns) < 1000
+        assert abs(scan.duration - CYCLES * model.cycle_ns * 1e-9) < 2e-6
+        assert scan.dropped == 0
+        number += 1
+    assert number == 3
+    assert sequence.imu() is sequence.gps() is sequence.truth() is None
+    assert sequence.warnings_so_far == ()
+
+
+def test_scans_are_turns_from_straight_ahead_and_can_be_taken_from_the_middle(tmp_path: Path) -> None:
+    # 0.75 of a turn before the first passage, 0.3 of a turn after the last one
+    path = write_pcap(tmp_path / "box.pcap", received(box(turns=4.05, begin_deg=90.0)))
+    sequence = open_sequence(path)
+    found = list(sequence.scans())
+    assert len(found) == sequence.info.scan_count == 4
+    packet = 4.8
+    for scan in found[1:]:
+        first = np.degrees(-np.arctan2(scan.points[0, 1], scan.points[0, 0])) % 360
+        assert first < 1e-3 or first > 360 - packet
+    # without a gap and without an overlap
+    for scan, following in pairwise(found):
+        assert scan.end_ns == following.stamp_ns
+    taken = list(sequence.scans(2, 1))
+    assert len(taken) == 1
+    for name in ("points", "time", "ring", "intensity"):
+        np.testing.assert_array_equal(getattr(taken[0], name), getattr(found[2], name))
+    assert taken[0].stamp_ns == found[2].stamp_ns
+    assert list(sequence.scans(4)) == []
+
+
+def test_a_part_of_a_turn_at_either_end_is_left_out(tmp_path: Path) -> None:
+    # 1/4 of a turn, two turns, 1/4 of a turn
+    found = scans_of(write_pcap(tmp_path / "a.pcap", received(box(turns=2.5, begin_deg=270.0))))
+    assert len(found) == 2
+    assert all(abs(scan.duration - 0.0995) < 0.002 for scan in found)
+    # nothing else is there
+    assert len(scans_of(write_pcap(tmp_path / "b.pcap", received(box(turns=0.25, begin_deg=270.0))))) == 1
+
+
+def test_the_clock_of_the_sensor_gives_the_stamps_over_the_top_of_the_hour(tmp_path: Path) -> None:
+    start_ns = (START_NS // HOUR_NS + 1) * HOUR_NS - 150_000_000
+    # packets reach the computer late, and not equally late
+    sent = [
+        Sent(time_ns + 3_000_000 + 40_000_000 * (number % 7 == 3), 2368, data)
+        for number, (time_ns, data) in enumerate(box(start_ns=start_ns))
+    ]
+    sequence = open_sequence(write_pcap(tmp_path / "box.pcap", sent))
+    assert "which keeps the time of day" in sequence.info.notes[1]
+    found = list(sequence.scans())
+    period_ns = CYCLES * VLP16.cycle_ns
+    for number, scan in enumerate(found):
+        assert abs(scan.stamp_ns - start_ns - number * period_ns) < 2000
+        assert abs(scan.time.max() - (period_ns - 20_000) * 1e-9) < 5e-6
+        assert (np.diff(scan.time) >= 0).all()
+    assert len(found) == 3
+    assert sequence.warnings_so_far == ()
+
+
+def test_a_sensor_without_the_time_of_day_takes_it_from_the_computer(tmp_path: Path) -> None:
+    # the sensor counts from its start; its first hour ends within the recording
+    start_ns, ahead_ns = HOUR_NS - 150_000_000, START_NS + 17 * 60 * 1_000_000_000
+    sent = received(box(start_ns=start_ns), ahead_ns, latency_ns=0)
+    sent = [one._replace(received_ns=one.received_ns + 5_000_000 * (k % 3)) for k, one in enumerate(sent)]
+    sequence = open_sequence(write_pcap(tmp_path / "box.pcap", sent))
+    assert "set by the computer's" in sequence.info.notes[1]
+    found = list(sequence.scans())
+    assert len(found) == 3
+    for number, scan in enumerate(found):
+        expected = start_ns + ahead_ns + number * CYCLES * VLP16.cycle_ns
+        assert abs(scan.stamp_ns - expected) < 3000
+
+
+def test_of_two_returns_the_strongest_is_taken(tmp_path: Path) -> None:
+    azimuth = turning(VLP16, 1.0)
+    near = box_ranges(VLP16, azimuth, HALF)
+    # a block holds two cycles; the last return is 2 m behind the strongest one
+    pairs = np.stack([(near + 2.0).reshape(-1, 2, 16), near.reshape(-1, 2, 16)], axis=1)
+    both = np.repeat(azimuth.reshape(-1, 1, 2), 2, axis=1)
+    written = packets(VLP16, pairs.reshape(-1, 16), both.ravel(), START_NS, mode=DUAL)
+    (scan,) = scans_of(write_pcap(tmp_path / "box.pcap", received(written)))
+    assert len(scan.points) == near.size
+    assert wall_distance(scan.points).max() < QUANTISED
+    assert scan.dropped == 0
+
+
+def test_firings_without_a_return_are_counted(tmp_path: Path) -> None:
+    azimuth = turning(VLP16, 1.0)
+    ranges = box_ranges(VLP16, azimuth, HALF)
+    ranges[::3, 5] = 0.0
+    path = write_pcap(tmp_path / "box.pcap", received(packets(VLP16, ranges, azimuth, START_NS)))
+    (scan,) = scans_of(path)
+    assert scan.dropped == 600
+    assert len(scan.points) == ranges.size - 600
+    assert np.count_nonzero(scan.ring == VLP16.ring[5]) == 1200
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"order": ">"},
+        {"nanoseconds": True},
+        {"link": RAW_IP},
+        {"link": COOKED},
+        {"vlan": True},
+        {"order": ">", "nanoseconds": True, "link": COOKED},
+    ],
+)
+def test_every_kind_of_capture_gives_the_same_scans(tmp_path: Path, options: dict) -> None:
+    # what else is on the line does not matter
+    sent = [Sent(START_NS, 8308, bytes(512)), *received(box(turns=1.6)), Sent(START_NS, 53, b"x")]
+    expected = scans_of(write_pcap(tmp_path / "plain.pcap", sent))
+    found = scans_of(write_pcap(tmp_path / "other.PCAP", sent, **options))
+    assert len(found) == len(expected) == 2
+    for scan, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(scan.points, other.points)
+        assert scan.stamp_ns == other.stamp_ns
+
+
+def test_lost_packets_shorten_their_own_turn_alone(tmp_path: Path) -> None:
+    sent = received(box(turns=4.0))
+    # the end of the second turn and the begin of the third one
+    found = scans_of(write_pcap(tmp_path / "box.pcap", sent[:140] + sent[155:]))
+    assert [len(scan.points) for scan in found] == [75 * 384, 65 * 384, 70 * 384, 75 * 384]
+    assert found[1].duration < 66 * 24 * VLP16.cycle_ns * 1e-9
+    assert all(wall_distance(scan.points).max() < QUANTISED for scan in found)
+
+
+def test_the_packets_of_a_second_sensor_are_left_out(tmp_path: Path) -> None:
+    mine, other = received(box()), [one._replace(source="192.168.1.202") for one in received(box())]
+    both = [one for pair in zip(mine, other, strict=True) for one in pair]
+    sequence = open_sequence(write_pcap(tmp_path / "box.pcap", both))
+    assert [len(scan.points) for scan in sequence.scans()] == [75 * 384] * 3
+    (warning,) = sequence.warnings_so_far
+    assert "holds the packets of 2 Velodynes; only those of 192.168.1.201 to port 2368 are read" in warning
+
+
+def test_a_truncated_capture_gives_its_whole_packets(tmp_path: Path) -> None:
+    path = write_pcap(tmp_path / "box.pcap", received(box()))
+    content = path.read_bytes()
+    for lost in (1, 500, 1250, 1255):
+        path.write_bytes(content[:-lost])
+        sequence = open_sequence(path)
+        assert [len(scan.points) for scan in sequence.scans()] == [75 * 384, 75 * 384, 74 * 384]
+        (warning,) = sequence.warnings_so_far
+        assert "box.pcap: truncated within the packet at byte" in warning
+
+
+def test_damage_ends_the_reading_with_a_warning(tmp_path: Path) -> None:
+    path = write_pcap(tmp_path / "box.pcap", received(box()))
+    content = bytearray(path.read_bytes())
+    record = 16 + 14 + 20 + 8 + 1206
+    at = 24 + 160 * record
+    content[at + 8 : at + 12] = b"\xff\xff\xff\x7f"
+    path.write_bytes(content)
+    sequence = open_sequence(path)
+    assert [len(scan.points) for scan in sequence.scans()] == [75 * 384, 75 * 384]
+    assert f"box.pcap: damaged at byte {at}" in sequence.warnings_so_far[0]
+
+
+def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_pcap(tmp_path / "box.pcap", received(box(turns=0.2)))
+    monkeypatch.setitem(sys.modules, "velodyne_decoder", None)
+    with pytest.raises(LioJaxError, match=r"box\.pcap: .*install it with pip install 'lio-jax\[pcap\]'\.$"):
+        open_sequence(path)
+
+
+def test_a_model_that_is_not_decoded_is_an_error(tmp_path: Path) -> None:
+    written = [(time_ns, data[:-1] + b"\x31") for time_ns, data in box(turns=0.5)]
+    path = write_pcap(tmp_path / "box.pcap", received(written))
+    with pytest.raises(LioJaxError, match=r"box\.pcap: .*Velarray.*let its driver write a ROS bag"):
+        open_sequence(path)
+
+
+def test_an_hdl64_needs_the_calibration_in_its_packets(tmp_path: Path) -> None:
+    # it sends its state, byte by byte, where others state the kind of return and the model
+    state = b"HMSDNYGTV"
+    written = [
+        (time_ns, data[:-2] + bytes([state[k % len(state)], k % 60]))
+        for k, (time_ns, data) in enumerate(box())
+    ]
+    path = write_pcap(tmp_path / "box.pcap", received(written))
+    with pytest.raises(LioJaxError, match=r"box\.pcap: .*HDL-64E, but do not hold its calibration"):
+        open_sequence(path)
