@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError, one_line
 from lio_jax.data.config import DataConfig
-from lio_jax.data.pcap_file import SUFFIXES, datagrams, unknown_capture
+from lio_jax.data.pcap_file import SUFFIXES, datagrams, first_datagrams, unknown_capture
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
 from lio_jax.data.time_order import Stamped, in_time_order
 
 INSTALL = "pip install --no-deps ouster-sdk"
 """Command that installs the library: its dependencies contradict ours, and captures are read without them."""
 
+_PORTS = frozenset({7502, 7503})
+"""UDP ports to which an Ouster sends unless it is told otherwise."""
 _VALID = 1
 """Bit of the status of a column that was measured."""
 _INTENSITY = ("SIGNAL", "REFLECTIVITY")
@@ -44,11 +46,7 @@ class OusterPcap:
             raise unknown_capture(path)
         described = _metadata_files(path)
         if not described:
-            raise unknown_capture(
-                path,
-                f" (an Ouster needs its metadata, a .json file, in the folder {path.parent}; ouster-cli and "
-                "Ouster Studio write it beside the capture)",
-            )
+            raise _without_metadata(path)
         self._sdk = _library(path)
         self._metadata, self._sensor = self._described(described)
         self._frames = self._opened()
@@ -90,8 +88,12 @@ class OusterPcap:
         stop = len(self._frames) if count is None else min(start + count, len(self._frames))
         if start >= stop:
             return
-        # frames share one reader, so each pass needs its own
-        for number, frames in enumerate(self._opened()[start:stop], start):
+        # frames share one reader, so each pass needs its own; after a jump the library loses the first packet
+        # of a frame if it came in fragments
+        before = max(start - 1, 0)
+        for number, frames in enumerate(self._opened()[before:stop], before):
+            if number < start:
+                continue
             name = f"{self._path.name}: scan {number}"
             scan = None if frames[0] is None else self._scan(frames[0])
             if scan is None:
@@ -172,6 +174,15 @@ def _metadata_files(path: Path) -> list[Path]:
     """Return the .json files beside a capture, the one with the most similar name first."""
     found = (file for file in path.parent.glob("*.json") if file.is_file())
     return sorted(found, key=lambda file: (-_equal_letters(file.stem, path.stem), file.name))
+
+
+def _without_metadata(path: Path) -> LioJaxError:
+    if _PORTS.isdisjoint(one.port for one in first_datagrams(path)):
+        return unknown_capture(path, f" ({path.stem}.json, which is not there)")
+    return LioJaxError(
+        f"{path}: is the capture of an Ouster, which cannot be read without the sensor's metadata; put the "
+        f".json file that was written with the capture beside it, as {path.stem}.json."
+    )
 
 
 def _equal_letters(one: str, other: str) -> int:
