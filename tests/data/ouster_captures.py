@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lio_jax.sim.lidar import SpinningLidar
+from lio_jax.sim.sequence import SimulatedSequence
 from tests.data.captures import Sent, write_pcap
 
 LIDAR_PORT, IMU_PORT = 7502, 7503
@@ -74,6 +76,35 @@ def lidar_packets(
         Sent(begin_ns + place * step_ns, LIDAR_PORT, packet.buf.tobytes())
         for place, packet in enumerate(packets)
     ]
+
+
+def simulated(drive: SimulatedSequence) -> tuple[dict[str, Any], list[Sent]]:
+    """Return metadata and packets of a simulated OS1-64 with its IMU."""
+    assert isinstance(drive.lidar, SpinningLidar)
+    described, T_imu_lidar = metadata(), drive.info.T_imu_lidar
+    assert T_imu_lidar is not None
+    beams = described["beam_intrinsics"]
+    # an Ouster counts azimuths clockwise
+    beams["beam_azimuth_angles"] = (-np.degrees(drive.lidar.azimuth)).tolist()
+    beams["beam_altitude_angles"] = np.degrees(drive.lidar.elevation).tolist()
+    # the simulated rays start at the sensor's origin
+    beams["lidar_origin_to_beam_origin_mm"] = 0.0
+    beams["beam_to_lidar_transform"] = np.eye(4).ravel().tolist()
+    described["lidar_intrinsics"]["lidar_to_sensor_transform"] = np.diag([-1.0, -1, 1, 1]).ravel().tolist()
+    T_lidar_imu = np.linalg.inv(T_imu_lidar)
+    T_lidar_imu[:3, 3] *= 1000
+    described["imu_intrinsics"]["imu_to_sensor_transform"] = T_lidar_imu.ravel().tolist()
+    sent = []
+    for number, scan in enumerate(drive.scans()):
+        ranges = np.zeros((64, COLUMNS))
+        column = np.rint(scan.time.astype(np.float64) * 1e9 / PERIOD_NS * COLUMNS).astype(int)
+        ranges[scan.ring, column] = np.linalg.norm(scan.points.astype(np.float64), axis=1)
+        sent += lidar_packets(described, ranges, number)
+    imu = drive.imu()
+    assert imu is not None
+    for stamp_ns, gyro, accel in zip(imu.stamp_ns, imu.gyro, imu.accel, strict=True):
+        sent.append(imu_packet(int(stamp_ns), (accel / 9.80665).tolist(), np.degrees(gyro).tolist()))
+    return described, sent
 
 
 def imu_packet(stamp_ns: int, accel_g: list[float], gyro_deg: list[float]) -> Sent:
