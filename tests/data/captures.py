@@ -17,6 +17,11 @@ from lio_jax.data.sequence import LidarScan
 from lio_jax.sim.lidar import SpinningLidar
 
 HOUR_NS = 3_600_000_000_000
+START_NS = 1_700_000_000_000_000_000
+HALF = np.array([5.0, 4.0, 1.5])
+"""Distances of the walls of a box from the sensor, m."""
+CYCLES = 1800
+"""Firings of each laser in a turn of 0.0995 s: the azimuth's step of 0.2 deg is exact."""
 ETHERNET, RAW_IP, COOKED = 1, 101, 113
 DUAL = 0x39
 """Mode of a sensor that sends the last and the strongest return of each firing."""
@@ -172,6 +177,20 @@ def box_ranges(model: Model, azimuth: NDArray[np.float64], half: NDArray[np.floa
     origin = np.stack([0 * model.height, 0 * model.height, model.height], axis=-1)
     with np.errstate(divide="ignore"):
         return ((np.copysign(half, ways) - origin) / ways).min(axis=-1)
+
+
+def turning(model: Model, turns: float, begin_deg: float = 0.0, cycles: int = CYCLES) -> NDArray[np.float64]:
+    """Return the azimuths of the cycles in so many turns, deg, in whole packets."""
+    number = round(turns * cycles) // model.cycles * model.cycles
+    return (begin_deg + 360 / cycles * np.arange(number)) % 360
+
+
+def box(
+    model: Model = VLP16, turns: float = 3.0, begin_deg: float = 0.0, start_ns: int = START_NS, **options: int
+) -> list[tuple[int, bytes]]:
+    """Return the packets of a sensor that stands in the box."""
+    azimuth = turning(model, turns, begin_deg)
+    return packets(model, box_ranges(model, azimuth, HALF), azimuth, start_ns, **options)
 
 
 def same_timing(lidar: SpinningLidar, model: Model, columns: int) -> SpinningLidar:

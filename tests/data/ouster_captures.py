@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from lio_jax.sim.lidar import SpinningLidar
 from lio_jax.sim.sequence import SimulatedSequence
-from tests.data.captures import Sent, write_pcap
+from tests.data.captures import HALF, START_NS, Sent, write_pcap
 
 LIDAR_PORT, IMU_PORT = 7502, 7503
-START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 100_000_000
 COLUMNS = 1024
 LIDAR_ABOVE_SENSOR = 0.03618
@@ -105,6 +104,13 @@ def simulated(drive: SimulatedSequence) -> tuple[dict[str, Any], list[Sent]]:
     for stamp_ns, gyro, accel in zip(imu.stamp_ns, imu.gyro, imu.accel, strict=True):
         sent.append(imu_packet(int(stamp_ns), (accel / 9.80665).tolist(), np.degrees(gyro).tolist()))
     return described, sent
+
+
+def frames(number: int = 4, profile: str = "LEGACY") -> tuple[dict[str, Any], list[Sent]]:
+    """Return metadata and packets of a sensor that stands in the box."""
+    described = metadata(profile)
+    ranges = box_ranges(described, HALF)
+    return described, [one for frame in range(number) for one in lidar_packets(described, ranges, frame)]
 
 
 def imu_packet(stamp_ns: int, accel_g: list[float], gyro_deg: list[float]) -> Sent:

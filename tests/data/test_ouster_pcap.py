@@ -9,13 +9,13 @@ import pytest
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data import open_sequence
-from tests.data.captures import COOKED, Sent
+from tests.data.captures import COOKED, HALF, START_NS
 from tests.data.ouster_captures import (
     COLUMNS,
     LIDAR_PORT,
     PERIOD_NS,
-    START_NS,
     box_ranges,
+    frames,
     imu_packet,
     lidar_packets,
     metadata,
@@ -25,15 +25,6 @@ from tests.data.ouster_captures import (
 pytest.importorskip(
     "ouster.sdk", reason="ouster-sdk is not installed; it comes with pip install --no-deps ouster-sdk"
 )
-
-HALF = np.array([5.0, 4.0, 1.5])
-"""Distances of the walls from the sensor's origin, m."""
-
-
-def frames(number: int = 4, profile: str = "LEGACY") -> tuple[dict, list[Sent]]:
-    described = metadata(profile)
-    ranges = box_ranges(described, HALF)
-    return described, [one for frame in range(number) for one in lidar_packets(described, ranges, frame)]
 
 
 def fault(path: Path) -> str:

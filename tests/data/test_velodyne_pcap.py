@@ -12,16 +12,21 @@ from lio_jax.data import open_sequence
 from lio_jax.data.sequence import LidarScan
 from tests.data.captures import (
     COOKED,
+    CYCLES,
     DUAL,
+    HALF,
     HDL32E,
     HOUR_NS,
     RAW_IP,
+    START_NS,
     VLP16,
     Model,
     Sent,
+    box,
     box_ranges,
     packets,
     received,
+    turning,
     write_pcap,
 )
 
@@ -29,26 +34,8 @@ pytest.importorskip(
     "velodyne_decoder", reason="velodyne-decoder is not installed; it comes with lio-jax[pcap]"
 )
 
-HALF = np.array([5.0, 4.0, 1.5])
-"""Distances of the walls, m."""
-START_NS = 1_700_000_000_000_000_000
 QUANTISED = 1.2e-3
 """Half of the step of ranges (2 mm) and half of that of azimuths (0.01 deg), at the corners of the box, m."""
-CYCLES = 1800
-"""Firings of each laser in a turn of 0.0995 s: the azimuth's step of 0.2 deg is exact."""
-
-
-def turning(model: Model, turns: float, begin_deg: float = 0.0, cycles: int = CYCLES) -> np.ndarray:
-    number = round(turns * cycles) // model.cycles * model.cycles
-    return (begin_deg + 360 / cycles * np.arange(number)) % 360
-
-
-def box(
-    model: Model = VLP16, turns: float = 3.0, begin_deg: float = 0.0, start_ns: int = START_NS, **options: int
-) -> list[tuple[int, bytes]]:
-    """Return the packets of a sensor that stands in the box."""
-    azimuth = turning(model, turns, begin_deg)
-    return packets(model, box_ranges(model, azimuth, HALF), azimuth, start_ns, **options)
 
 
 def scans_of(path: Path) -> list[LidarScan]:
