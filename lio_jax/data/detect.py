@@ -41,7 +41,8 @@ def open_sequence(path: Path | str, config: DataConfig | None = None) -> Sequenc
 
     Args:
         path: a KITTI odometry sequence folder, a KITTI raw drive folder, a ROS 1 or ROS 2 bag, a native
-            folder, or a folder of clouds; or ``evalio:DATASET/SEQUENCE``, a sequence that evalio knows.
+            folder, a packet capture, or a folder of clouds; or ``evalio:DATASET/SEQUENCE``, a sequence that
+            evalio knows.
         config: how the recording is read; None: the defaults, which recognise everything from the data.
 
     Raises:

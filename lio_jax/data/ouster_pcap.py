@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError, one_line
+from lio_jax.core.timestamps import FARTHEST_NS
 from lio_jax.data.config import DataConfig
 from lio_jax.data.pcap_file import SUFFIXES, datagrams, first_datagrams, unknown_capture
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
 from lio_jax.data.time_order import Stamped, in_time_order
+from lio_jax.data.trajectory import are_rigid
 
 INSTALL = "pip install --no-deps ouster-sdk"
 """Command that installs the library: its dependencies contradict ours, and captures are read without them."""
@@ -21,6 +23,10 @@ _PORTS = frozenset({7502, 7503})
 """UDP ports to which an Ouster sends unless it is told otherwise."""
 _VALID = 1
 """Bit of the status of a column that was measured."""
+_LONGEST_NS = 500_000_000
+"""Longest time between two columns of a frame, ns; the slowest rate is 5 Hz."""
+_FRAMES_LOOKED_AT = 8
+_YEAR_2000_NS = 946_684_800_000_000_000
 _INTENSITY = ("SIGNAL", "REFLECTIVITY")
 """Fields that are read as intensity; the first one that the sensor sends."""
 
@@ -51,16 +57,21 @@ class OusterPcap:
         self._metadata, self._sensor = self._described(described)
         self._frames = self._opened()
         self._project = self._sdk.core.XYZLut(self._sensor, use_extrinsics=False)
+        first = next(self._scans(0, _FRAMES_LOOKED_AT), None)
+        if first is None:
+            raise LioJaxError(f"{path}: its first frames hold no measured column; record the sensor at work.")
+        clock = [] if first.stamp_ns > _YEAR_2000_NS else ["stamps: the time since the sensor's start"]
         self.info = SequenceInfo(
             name=path.stem,
             format="ouster_pcap",
             path=str(path),
             scan_count=len(self._frames),
-            T_imu_lidar=_inverse(_in_metres(self._sensor.imu_to_sensor_transform)),
+            T_imu_lidar=self._extrinsic(),
             sensor=f"Ouster {self._sensor.prod_line}",
             notes=(
                 f"packets of an Ouster {self._sensor.prod_line}, with the metadata of {self._metadata.name}",
                 "points in the sensor's frame; T_imu_lidar is that of the metadata",
+                *clock,
             ),
         )
 
@@ -102,10 +113,13 @@ class OusterPcap:
             yield Stamped(scan.stamp_ns, name, scan)
 
     def _scan(self, frame: Any) -> LidarScan | None:
-        measured = np.flatnonzero(frame.status & _VALID)
+        measured = np.flatnonzero((frame.status & _VALID) & (frame.timestamp < FARTHEST_NS))
         if not len(measured):
             return None
         stamps = frame.timestamp[measured].astype(np.int64)
+        # a damaged stamp of one column must not stretch the frame
+        near = np.abs(stamps - np.median(stamps).astype(np.int64)) < _LONGEST_NS
+        measured, stamps = measured[near], stamps[near]
         start_ns = int(stamps.min())
         # the frame lasts until the next column would be measured
         columns = max(int(measured[-1] - measured[0]), 1)
@@ -155,6 +169,17 @@ class OusterPcap:
                 failed = failed or f"{file}: is no metadata of an Ouster ({one_line(str(error))})"
         raise LioJaxError(f"{failed}; put the metadata of {self._path.name} in its place.")
 
+    def _extrinsic(self) -> NDArray[np.float64]:
+        """Return the pose of the sensor's frame in that of its IMU, (4, 4) m."""
+        T_sensor_imu = np.array(self._sensor.imu_to_sensor_transform, np.float64)
+        if not are_rigid(T_sensor_imu[None]).all():
+            raise LioJaxError(
+                f"{self._metadata}: imu_to_sensor_transform is no rotation with a translation; put the "
+                f"metadata of {self._path.name} in its place."
+            )
+        T_sensor_imu[:3, 3] *= 1e-3
+        return np.asarray(np.linalg.inv(T_sensor_imu), np.float64)
+
     def _opened(self) -> Any:
         try:
             frames = self._sdk.open_source(
@@ -188,16 +213,6 @@ def _without_metadata(path: Path) -> LioJaxError:
 def _equal_letters(one: str, other: str) -> int:
     """Return the number of letters with which both names begin."""
     return next((place for place, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), len(one))
-
-
-def _in_metres(transform: NDArray[np.float64]) -> NDArray[np.float64]:
-    scaled = np.array(transform, np.float64)
-    scaled[:3, 3] *= 1e-3
-    return scaled
-
-
-def _inverse(transform: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.linalg.inv(transform), np.float64)
 
 
 def _library(path: Path) -> Any:

@@ -1,6 +1,7 @@
 """Captures of an Ouster give back the walls of a box, its times and its inertial samples."""
 
 import json
+import struct
 import sys
 from pathlib import Path
 
@@ -107,6 +108,44 @@ def test_an_imu_that_is_turned_in_the_sensor(tmp_path: Path) -> None:
     T_imu_lidar = open_sequence(write_capture(tmp_path / "box.pcap", described, sent)).info.T_imu_lidar
     assert T_imu_lidar is not None
     np.testing.assert_allclose(T_imu_lidar @ [0.010, 1.020, 0.030, 1.0], [1, 0, 0, 1], atol=1e-12)
+
+
+def test_a_transform_that_is_no_rotation_is_refused(tmp_path: Path) -> None:
+    described, sent = frames(1)
+    described["imu_intrinsics"]["imu_to_sensor_transform"][0] = 2.0
+    message = fault(write_capture(tmp_path / "box.pcap", described, sent))
+    assert "box.json: imu_to_sensor_transform is no rotation with a translation; put the" in message
+
+
+@pytest.mark.parametrize("wrong_ns", [0, START_NS - 10**12, START_NS + 10**12, 2**64 - 1])
+def test_a_damaged_stamp_of_a_column_costs_this_column_alone(tmp_path: Path, wrong_ns: int) -> None:
+    described, sent = frames(2)
+    # the first column of the third packet begins with its time
+    data = struct.pack("<Q", wrong_ns) + sent[2].data[8:]
+    sent[2] = sent[2]._replace(data=data)
+    found = list(open_sequence(write_capture(tmp_path / "box.pcap", described, sent)).scans())
+    assert [len(scan.points) for scan in found] == [(COLUMNS - 1) * 64, COLUMNS * 64]
+    assert [scan.stamp_ns for scan in found] == [START_NS, START_NS + PERIOD_NS]
+    assert found[0].duration == pytest.approx(0.1, abs=1e-6)
+
+
+def test_a_sensor_that_counts_from_its_start_is_named(tmp_path: Path) -> None:
+    described, sent = frames(1)
+    early = [
+        one._replace(
+            data=b"".join(
+                struct.pack("<Q", int.from_bytes(one.data[at : at + 8], "little") - START_NS + 10**10)
+                + one.data[at + 8 : at + 788]
+                for at in range(0, 12608, 788)
+            )
+        )
+        for one in sent
+    ]
+    sequence = open_sequence(write_capture(tmp_path / "box.pcap", described, early))
+    assert "stamps: the time since the sensor's start" in sequence.info.notes
+    (scan,) = sequence.scans()
+    assert scan.stamp_ns == 10**10
+    assert len(scan.points) == COLUMNS * 64
 
 
 def test_scans_can_be_taken_from_the_middle(tmp_path: Path) -> None:
