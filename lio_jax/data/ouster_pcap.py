@@ -16,7 +16,7 @@ from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceI
 from lio_jax.data.time_order import Stamped, in_time_order
 from lio_jax.data.trajectory import are_rigid
 
-INSTALL = "pip install --no-deps ouster-sdk"
+INSTALL = "pip install --no-deps 'ouster-sdk>=1.0'"
 """Command that installs the library: its dependencies contradict ours, and captures are read without them."""
 
 _PORTS = frozenset({7502, 7503})
@@ -218,11 +218,13 @@ def _equal_letters(one: str, other: str) -> int:
 def _library(path: Path) -> Any:
     try:
         from ouster import sdk
-        from ouster.sdk import core  # noqa: F401
+
+        # before version 1.0 frames had another name
+        from ouster.sdk.core import LidarFrame  # noqa: F401
     except ImportError:
         raise LioJaxError(
-            f"{path}: captures of an Ouster are decoded by ouster-sdk, which is not installed; install it "
-            f"with {INSTALL}."
+            f"{path}: captures of an Ouster are decoded by ouster-sdk 1.0 or newer, which is not installed; "
+            f"install it with {INSTALL}."
         ) from None
     return sdk
 

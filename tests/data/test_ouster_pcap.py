@@ -220,7 +220,7 @@ def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for name in ("ouster", "ouster.sdk", "ouster.sdk.core"):
         monkeypatch.setitem(sys.modules, name, None)
     message = fault(path)
-    assert message.endswith("is not installed; install it with pip install --no-deps ouster-sdk.")
+    assert message.endswith("is not installed; install it with pip install --no-deps 'ouster-sdk>=1.0'.")
     assert "box.pcap: " in message
 
 
