@@ -1,5 +1,6 @@
 """Captures of Velodyne lidars, written byte by byte, give back the walls of a box and the times of firing."""
 
+import struct
 import sys
 from itertools import pairwise
 from pathlib import Path
@@ -254,3 +255,51 @@ def test_an_hdl64_needs_the_calibration_in_its_packets(tmp_path: Path) -> None:
     path = write_pcap(tmp_path / "box.pcap", received(written))
     with pytest.raises(LioJaxError, match=r"box\.pcap: .*HDL-64E, but do not hold its calibration"):
         open_sequence(path)
+
+
+def hdl64_state(elevation: np.ndarray) -> list[bytes]:
+    """Return the last two bytes of successive packets of an HDL-64E S2: what they state, and its value.
+
+    Source: Velodyne, "HDL-64E S2 User's Manual" (63-HDL64ES2), appendix E: the time, the state, and the
+    calibration of each laser in 28 bytes.
+    """
+    calibration = b"UNIT#" + bytes(2)
+    for laser, angle in enumerate(elevation):
+        numbers = (laser, round(angle * 100), *(0,) * 8, 0, 255)
+        calibration += struct.pack("<BhhhhhhhhhBB", *numbers) + bytes([13, 5, 6, 10, 20, 30, 0])
+    calibration += bytes(19) + struct.pack("<H", 1820)
+    state = zip(b"HMSDNYGTV", (10, 20, 30, 6, 5, 13, 1, 20, 1), strict=True)
+    return [bytes(pair) for pair in [*state, *((ord("1"), value) for value in calibration)]]
+
+
+def test_an_hdl64_is_read_with_the_calibration_in_its_packets(tmp_path: Path) -> None:
+    elevation = np.linspace(2.0, -24.0, 64).round(2)
+    state = hdl64_state(elevation)
+    # six firings of all lasers in a packet, 0.18 deg and 48 us apart; 2000 of them are a turn
+    azimuth = 0.18 * np.arange(6 * len(state)) % 360
+    ways = np.stack([np.cos(np.radians(elevation)), np.sin(np.radians(elevation))])
+    sent = []
+    for number, ending in enumerate(state):
+        data = b""
+        for degrees in azimuth[6 * number : 6 * number + 6]:
+            sides = np.abs([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+            # the wall is met where the first of its coordinates is reached
+            distance = 1 / np.maximum((sides / HALF[:2]).max() * ways[0], np.abs(ways[1]) / HALF[2])
+            for flag, part in ((0xEEFF, distance[:32]), (0xDDFF, distance[32:])):
+                data += struct.pack("<HH", flag, round(degrees * 100) % 36000)
+                data += b"".join(struct.pack("<HB", round(one / 0.002), 9) for one in part)
+        time_ns = START_NS + number * 288_000
+        sent.append(Sent(time_ns, 2368, data + struct.pack("<I", time_ns % HOUR_NS // 1000) + ending))
+    sequence = open_sequence(write_pcap(tmp_path / "a.pcap", sent))
+    assert sequence.info.sensor == "Velodyne HDL64E_S2"
+    first, *others = sequence.scans()
+    assert len(others) == 4
+    for scan in others:
+        # the head turns by 0.17 deg between the lasers of a firing, for which these ranges do not account
+        assert wall_distance(scan.points).max() < 0.02
+        assert abs(scan.duration - 2000 * 48e-6) < 3e-4
+        assert abs(len(scan.points) - 128_000) < 500
+    # rings count from the lowest laser
+    assert np.unique(first.ring).tolist() == list(range(64))
+    angles = np.degrees(np.arctan2(first.points[:, 2], np.hypot(*first.points[:, :2].T)))
+    np.testing.assert_allclose(angles, np.sort(elevation)[first.ring], atol=0.01)
