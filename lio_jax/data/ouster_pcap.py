@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError, one_line
 from lio_jax.core.timestamps import FARTHEST_NS
+from lio_jax.data.cloud_fields import valid_returns
 from lio_jax.data.config import DataConfig
 from lio_jax.data.pcap_file import SUFFIXES, datagrams, first_datagrams, unknown_capture
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
@@ -129,13 +130,18 @@ class OusterPcap:
         intensity = next((frame.field(name) for name in _INTENSITY if name in frame.fields), ranges)
         # column by column, as the sensor fires
         column, ring = np.nonzero(ranges.T)
-        at = measured[column]
+        with np.errstate(over="ignore"):
+            points = self._project(frame)[ring, measured[column]].astype(np.float32)
+        # the angles and lengths of damaged metadata may be anything
+        kept = valid_returns(points)
+        if not kept.all():
+            points, column, ring = points[kept], column[kept], ring[kept]
         return LidarScan(
             stamp_ns=start_ns,
-            points=self._project(frame)[ring, at].astype(np.float32),
+            points=points,
             time=((stamps - start_ns) * 1e-9).astype(np.float32)[column],
             ring=ring.astype(np.int32),
-            intensity=intensity[ring, at].astype(np.float32),
+            intensity=intensity[ring, measured[column]].astype(np.float32),
             duration=duration_ns * 1e-9,
             dropped=ranges.size - len(ring),
         )
@@ -171,7 +177,8 @@ class OusterPcap:
 
     def _extrinsic(self) -> NDArray[np.float64]:
         """Return the pose of the sensor's frame in that of its IMU, (4, 4) m."""
-        T_sensor_imu = np.array(self._sensor.imu_to_sensor_transform, np.float64)
+        T_sensor_imu = np.eye(4)
+        T_sensor_imu[:3] = self._sensor.imu_to_sensor_transform[:3]
         if not are_rigid(T_sensor_imu[None]).all():
             raise LioJaxError(
                 f"{self._metadata}: imu_to_sensor_transform is no rotation with a translation; put the "

@@ -117,6 +117,25 @@ def test_a_transform_that_is_no_rotation_is_refused(tmp_path: Path) -> None:
     assert "box.json: imu_to_sensor_transform is no rotation with a translation; put the" in message
 
 
+def test_the_last_row_of_a_transform_does_not_matter(tmp_path: Path) -> None:
+    described, sent = frames(1)
+    described["imu_intrinsics"]["imu_to_sensor_transform"][15] = 1e-320
+    T_imu_lidar = open_sequence(write_capture(tmp_path / "box.pcap", described, sent)).info.T_imu_lidar
+    assert T_imu_lidar is not None
+    np.testing.assert_allclose(T_imu_lidar[:3, 3], [-0.006253, 0.011775, -0.007645], atol=1e-12)
+    np.testing.assert_array_equal(T_imu_lidar[3], [0, 0, 0, 1])
+
+
+def test_points_that_are_not_finite_are_dropped(tmp_path: Path) -> None:
+    described, sent = frames(1)
+    described["beam_intrinsics"]["lidar_origin_to_beam_origin_mm"] = 1e300
+    described["beam_intrinsics"]["beam_to_lidar_transform"][3] = 1e300
+    for scan in open_sequence(write_capture(tmp_path / "box.pcap", described, sent)).scans():
+        assert np.isfinite(scan.points).all()
+        assert len(scan.points) == len(scan.ring) == len(scan.time) == len(scan.intensity)
+        assert len(scan.points) + scan.dropped == COLUMNS * 64
+
+
 @pytest.mark.parametrize("wrong_ns", [0, START_NS - 10**12, START_NS + 10**12, 2**64 - 1])
 def test_a_damaged_stamp_of_a_column_costs_this_column_alone(tmp_path: Path, wrong_ns: int) -> None:
     described, sent = frames(2)
