@@ -23,13 +23,13 @@ INSTALL = "pip install --no-deps 'ouster-sdk>=1.0'"
 _PORTS = frozenset({7502, 7503})
 """UDP ports to which an Ouster sends unless it is told otherwise."""
 _VALID = 1
-"""Bit of the status of a column that was measured."""
+"""Bit of the status of a column or of an inertial sample that was measured."""
 _LONGEST_NS = 500_000_000
 """Longest time between two columns of a frame, ns; the slowest rate is 5 Hz."""
 _FRAMES_LOOKED_AT = 8
 _YEAR_2000_NS = 946_684_800_000_000_000
 _INTENSITY = ("SIGNAL", "REFLECTIVITY")
-"""Fields that are read as intensity; the first one that the sensor sends."""
+"""Fields that are read as intensity: the first one that the sensor sends. Every profile has one of them."""
 
 
 class OusterPcap:
@@ -127,7 +127,7 @@ class OusterPcap:
         duration_ns = int(stamps.max()) - start_ns
         duration_ns += duration_ns // columns
         ranges = frame.field("RANGE")[:, measured]
-        intensity = next((frame.field(name) for name in _INTENSITY if name in frame.fields), ranges)
+        intensity = frame.field(next(name for name in _INTENSITY if name in frame.fields))
         # column by column, as the sensor fires
         column, ring = np.nonzero(ranges.T)
         with np.errstate(over="ignore"):
@@ -152,10 +152,12 @@ class OusterPcap:
         packets = self._sdk.open_packet_source(str(self._path), meta=[str(self._metadata)])
         for _, packet in packets:
             if isinstance(packet, self._sdk.core.ImuPacket):
+                # newer packets hold several samples
+                measured = packet.status() & _VALID > 0
+                stamps.append(packet.timestamp()[measured])
                 # the library gives rad/s and m/s^2
-                stamps.append(packet.timestamp())
-                gyro.append(packet.gyro())
-                accel.append(packet.accel())
+                gyro.append(packet.gyro()[measured])
+                accel.append(packet.accel()[measured])
         if not stamps:
             return None
         return ImuData(

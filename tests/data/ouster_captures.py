@@ -64,15 +64,29 @@ def lidar_packets(
     frame = core.LidarFrame(info)
     frame.frame_id = number + 1
     frame.field("RANGE")[:] = np.rint(ranges * 1000)
-    frame.field("SIGNAL")[:] = signal
+    frame.field("SIGNAL" if "SIGNAL" in frame.fields else "REFLECTIVITY")[:] = signal
     frame.status[:] = 1
     frame.measurement_id[:] = np.arange(COLUMNS)
     frame.timestamp[:] = START_NS + number * PERIOD_NS + np.arange(COLUMNS) * PERIOD_NS // COLUMNS
+    if "IMU_ACC" in frame.fields:
+        samples = len(frame.field("IMU_STATUS"))
+        at = np.arange(samples) * PERIOD_NS // samples
+        frame.field("IMU_TIMESTAMP")[:] = START_NS + number * PERIOD_NS + at
+        frame.field("IMU_PACKET_TIMESTAMP")[:] = START_NS + number * PERIOD_NS + 1
+        frame.field("IMU_MEASUREMENT_ID")[:] = np.arange(samples) * (COLUMNS // samples)
+        frame.field("IMU_ACC")[:] = [0.5, -1.5, 9.75]
+        frame.field("IMU_GYRO")[:] = [0.25, -0.5, 1.0]
+        # one sample of each frame was not measured
+        frame.field("IMU_STATUS")[:] = np.arange(samples) != 5
     packets = core.frame_to_packets(frame, core.PacketFormat(info), info.init_id, info.sn)
     step_ns = PERIOD_NS // len(packets)
     begin_ns = START_NS + number * PERIOD_NS + 3_000_000
     return [
-        Sent(begin_ns + place * step_ns, LIDAR_PORT, packet.buf.tobytes())
+        Sent(
+            begin_ns + place * step_ns,
+            IMU_PORT if isinstance(packet, core.ImuPacket) else LIDAR_PORT,
+            packet.buf.tobytes(),
+        )
         for place, packet in enumerate(packets)
     ]
 

@@ -84,6 +84,31 @@ def test_the_sensors_own_imu_is_read(tmp_path: Path) -> None:
     assert len(list(sequence.scans())) == 2
 
 
+def test_newer_packets_of_the_imu_hold_several_samples(tmp_path: Path) -> None:
+    described = metadata("RNG19_RFL8_SIG16_NIR16")
+    described["lidar_data_format"]["udp_profile_imu"] = "ACCEL32_GYRO32_NMEA"
+    described["imu_data_format"] = {"imu_measurements_per_packet": 8, "imu_packets_per_frame": 8}
+    ranges = box_ranges(described, HALF)
+    sent = [one for number in range(2) for one in lidar_packets(described, ranges, number)]
+    sequence = open_sequence(write_capture(tmp_path / "box.pcap", described, sent))
+    imu = sequence.imu()
+    assert imu is not None
+    measured = np.delete(np.arange(64), 5) * PERIOD_NS // 64
+    np.testing.assert_array_equal(imu.stamp_ns, np.r_[START_NS + measured, START_NS + PERIOD_NS + measured])
+    # these are in m/s^2 and rad/s already
+    np.testing.assert_array_equal(imu.accel, np.tile([0.5, -1.5, 9.75], (126, 1)))
+    np.testing.assert_array_equal(imu.gyro, np.tile([0.25, -0.5, 1.0], (126, 1)))
+    assert [len(scan.points) for scan in sequence.scans()] == [COLUMNS * 64] * 2
+
+
+def test_a_profile_without_signal_gives_reflectivity(tmp_path: Path) -> None:
+    sequence = open_sequence(write_capture(tmp_path / "box.pcap", *frames(1, "RNG15_RFL8_NIR8")))
+    (scan,) = sequence.scans()
+    assert (scan.intensity == 77).all()
+    # ranges are in 8 mm
+    assert np.abs(np.abs(scan.points) - HALF).min(axis=1).max() < 9e-3
+
+
 def test_an_imu_that_is_turned_in_the_sensor(tmp_path: Path) -> None:
     described, sent = frames(1)
     # x of the IMU is y of the sensor
