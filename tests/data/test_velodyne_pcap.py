@@ -130,9 +130,12 @@ def test_the_clock_of_the_sensor_gives_the_stamps_over_the_top_of_the_hour(tmp_p
     assert sequence.warnings_so_far == ()
 
 
-def test_a_sensor_without_the_time_of_day_takes_it_from_the_computer(tmp_path: Path) -> None:
+# half an hour apart, delays of some ms must not change the hour
+@pytest.mark.parametrize("minutes", [17, 30, 59])
+def test_a_sensor_without_the_time_of_day_takes_it_from_the_computer(tmp_path: Path, minutes: int) -> None:
     # the sensor counts from its start; its first hour ends within the recording
-    start_ns, ahead_ns = HOUR_NS - 150_000_000, START_NS + 17 * 60 * 1_000_000_000
+    start_ns = HOUR_NS - 150_000_000
+    ahead_ns = START_NS // HOUR_NS * HOUR_NS + minutes * 60 * 1_000_000_000 - 3_000_000
     sent = received(box(start_ns=start_ns), ahead_ns, latency_ns=0)
     sent = [one._replace(received_ns=one.received_ns + 5_000_000 * (k % 3)) for k, one in enumerate(sent)]
     sequence = open_sequence(write_pcap(tmp_path / "box.pcap", sent))
