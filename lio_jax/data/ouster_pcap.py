@@ -90,7 +90,7 @@ class OusterPcap:
         return self._imu
 
     def gps(self) -> GpsData | None:
-        """Return None: fixes in a capture have no height."""
+        """Return None: the sentences of a receiver at the sensor are not read."""
         return None
 
     def truth(self) -> None:

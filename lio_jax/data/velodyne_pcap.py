@@ -105,11 +105,11 @@ class VelodynePcap:
         yield from in_time_order(self._scans(start, count), self._log.add)
 
     def imu(self) -> ImuData | None:
-        """Return None: the inertial samples of an HDL-32E have no known time."""
+        """Return None: the inertial samples in the position packets of an HDL-32E are not read."""
         return None
 
     def gps(self) -> GpsData | None:
-        """Return None: fixes in a capture have no height."""
+        """Return None: the fixes in position packets are not read."""
         return None
 
     def truth(self) -> None:
