@@ -97,7 +97,7 @@ def inspect(
     """Show a recording's contents, its faults, and the settings that fit it.
 
     Args:
-        data: Recording: KITTI folder, ROS bag, folder of clouds, native folder, or evalio:NAME.
+        data: Recording: KITTI folder, ROS bag, .pcap, folder of clouds, native folder, or evalio:NAME.
         json: Print one JSON object instead of a table.
         write_config: Write the settings that fit, for --recipe of lio-jax run.
         overwrite: Replace an existing file.
@@ -126,8 +126,8 @@ def run(
     """Estimate trajectory and map of a recording.
 
     Args:
-        data: Recording: KITTI odometry sequence or raw drive, ROS bag, folder of clouds, native folder, or
-            evalio:NAME.
+        data: Recording: KITTI odometry sequence or raw drive, ROS bag, .pcap, folder of clouds, native
+            folder, or evalio:NAME.
         out: Folder for the results.
         recipe: Recipe, settings file, or class of your own recipe; a run's config.yaml repeats that run.
             None means default, or with --params-from the recipe that follows that system.
@@ -213,7 +213,7 @@ def export(
     """Write a recording in another format: ROS bag, KITTI odometry sequence or native folder.
 
     Args:
-        data: Recording: KITTI folder, ROS bag, folder of clouds, native folder, or evalio:NAME.
+        data: Recording: KITTI folder, ROS bag, .pcap, folder of clouds, native folder, or evalio:NAME.
         to: Output format.
         out: Output: *.bag (ROS 1), *.mcap or *.db3 (ROS 2); else a folder.
         layout: Make of the LiDAR whose messages a bag gets: velodyne, ouster or livox.

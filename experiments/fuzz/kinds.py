@@ -15,6 +15,7 @@ _RUN = ("run", "{in}/drive", "--scans", "3", "--out", "{out}/r", "--set", *_PLAI
 _TEXT = (mutations.text,) * 6 + (mutations.raw, mutations.whole)
 _NPZ = (mutations.array,) * 6 + (mutations.raw, mutations.raw, mutations.whole)
 _TREE = (mutations.tree,) * 8 + (mutations.raw, mutations.whole)
+_PCAP = (mutations.number("pcap"),) * 6 + (mutations.raw, mutations.raw, mutations.whole)
 _ANY = (mutations.fitting,) * 6 + (mutations.raw, mutations.whole)
 _COPIED = ("gyro", "accel", "orientation", "position", "covariance", "origin", "intensity")
 """Arrays of a recording that an export copies as they are; a run leaves out what is not finite."""
@@ -80,6 +81,20 @@ def _clouds(folder: str, files: str, draws: tuple[Draw, ...]) -> Kind:
     command = ("export", f"{{in}}/{folder}", "--to", "native", "--out", "{out}/r")
     name = f"clouds {folder} {files.partition('.')[2]}"
     return Kind(name, "clouds", (f"{folder}/{files}",), draws, (command,), may_be_nan=_COPIED)
+
+
+def _capture(sensor: str, file: str, draws: tuple[Draw, ...]) -> Kind:
+    data = f"{{in}}/{sensor}/a.pcap"
+    commands = (("export", data, "--to", "native", "--out", "{out}/r"), ("inspect", data, "--json"))
+    kind = f"{sensor} {file.rpartition('.')[2]}"
+    return Kind(
+        kind,
+        "captures",
+        (f"{sensor}/{file}",),
+        draws,
+        (commands[0],) * 4 + (commands[1],),
+        may_be_nan=_COPIED,
+    )
 
 
 _NOWHERE = r"nowhere: no such file or folder"
@@ -153,6 +168,9 @@ KINDS = (
     _clouds("npy", "*.npy", (mutations.raw, mutations.raw, mutations.whole)),
     _clouds("bin", "*.bin", (mutations.raw, mutations.whole)),
     _clouds("las", "*.las", (*(mutations.number("las"),) * 4, mutations.raw, mutations.raw, mutations.whole)),
+    _capture("velodyne", "a.pcap", _PCAP),
+    _capture("ouster", "a.pcap", _PCAP),
+    _capture("ouster", "a.json", _TREE),
     Kind(
         "tum",
         "poses",

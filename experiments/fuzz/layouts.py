@@ -142,11 +142,29 @@ def las_header(data: bytes) -> Iterator[Number]:
         yield from (Number(place, 1) for entry in range(body, start, 192) for place in (entry + 2, entry + 3))
 
 
+def pcap_records(data: bytes) -> Iterator[Number]:
+    """Yield the numbers of a capture's header, and those with which its records begin.
+
+    Behind a record's time and lengths lie the headers of Ethernet, IP and UDP, and the begin of the data.
+    """
+    yield from (Number(place, size) for place, size in ((0, 4), (4, 2), (6, 2), (16, 4), (20, 4)))
+    start = 24
+    while start + 16 <= len(data):
+        yield from (Number(start + place, 4) for place in range(0, 16, 4))
+        head = start + 16
+        yield from (Number(head + 12 + place, 2, True) for place in range(0, 42, 2))
+        yield from (Number(head + 42 + place, size) for place in (0, 2, 8) for size in (2, 4, 8))
+        start = head + int.from_bytes(data[start + 8 : start + 12], "little")
+        # the end of the data: the time, the return and the model of a Velodyne
+        yield from (Number(start - place, size) for place, size in ((6, 4), (2, 1), (1, 1)))
+
+
 NUMBERS: dict[str, Callable[[bytes], Iterator[Number]]] = {
     "ros1": ros1_records,
     "messages": ros1_messages,
     "mcap": mcap_records,
     "sqlite": sqlite_pages,
     "las": las_header,
+    "pcap": pcap_records,
 }
 """Finders of numbers, by the name of a layout."""

@@ -9,6 +9,7 @@ from laspy import ExtraBytesParams, LasData, LasHeader
 from pypcd4 import Encoding, PointCloud
 from scipy.spatial.transform import Rotation
 
+from experiments.fuzz.captures import write_captures
 from lio_jax.data import write_native
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan
 from lio_jax.data.trajectory import Trajectory, pose_matrices, write_kitti_poses, write_tum
@@ -143,6 +144,7 @@ def write_seeds(root: Path, run: Run, with_run: bool) -> None:
     must("export", native, "--to", "kitti", "--out", root / "kitti" / "04")
     _write_kitti_raw(root / "kitti_raw" / "day")
     _write_clouds(root / "clouds")
+    write_captures(root / "captures", START_NS)
     _write_texts(root)
     (root / "native" / "my.yaml").write_text(SETTINGS)
     (root / "rest").mkdir()

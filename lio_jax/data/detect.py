@@ -4,11 +4,28 @@ from dataclasses import fields
 from pathlib import Path
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data import clouds, evalio_sequences, kitti, kitti_raw, native, rosbag
+from lio_jax.data import (
+    clouds,
+    evalio_sequences,
+    kitti,
+    kitti_raw,
+    native,
+    ouster_pcap,
+    rosbag,
+    velodyne_pcap,
+)
 from lio_jax.data.config import DataConfig
 from lio_jax.data.sequence import Reader, Sequence, entries
 
-READERS = (kitti.READER, kitti_raw.READER, native.READER, rosbag.READER, clouds.READER)
+READERS = (
+    kitti.READER,
+    kitti_raw.READER,
+    native.READER,
+    rosbag.READER,
+    velodyne_pcap.READER,
+    ouster_pcap.READER,
+    clouds.READER,
+)
 """Readers of files; the first one that recognises a path opens it. A new format is a module and an entry."""
 BY_NAME = evalio_sequences.READER
 """The reader of sequences that are no path."""
@@ -24,7 +41,8 @@ def open_sequence(path: Path | str, config: DataConfig | None = None) -> Sequenc
 
     Args:
         path: a KITTI odometry sequence folder, a KITTI raw drive folder, a ROS 1 or ROS 2 bag, a native
-            folder, or a folder of clouds; or ``evalio:DATASET/SEQUENCE``, a sequence that evalio knows.
+            folder, a packet capture, or a folder of clouds; or ``evalio:DATASET/SEQUENCE``, a sequence that
+            evalio knows.
         config: how the recording is read; None: the defaults, which recognise everything from the data.
 
     Raises:

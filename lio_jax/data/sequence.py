@@ -93,7 +93,8 @@ class SequenceInfo:
     name: str
     """Short name of the recording for titles and file names."""
     format: str
-    """Reader that opened it: kitti_odometry, kitti_raw, rosbag, native, clouds or evalio; or "simulated", or
+    """Reader that opened it: kitti_odometry, kitti_raw, rosbag, native, velodyne_pcap, ouster_pcap, clouds or
+    evalio; or "simulated", or
     "pushed" for data that arrive in turn."""
     path: str
     scan_count: int

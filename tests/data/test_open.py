@@ -10,7 +10,9 @@ from lio_jax.data import detect, native, open_sequence, write_native
 from lio_jax.data.config import DataConfig
 from lio_jax.data.sequence import Reader
 from tests.data import bags
+from tests.data.captures import box, received, write_pcap
 from tests.data.cloud_files import write_pcd_folder
+from tests.data.ouster_captures import frames, write_capture
 from tests.data.test_kitti import write_sequence
 from tests.data.test_kitti_raw import write_drive
 from tests.data.test_native import scans
@@ -56,6 +58,14 @@ def _own(kind: str, folder: Path) -> Path:
         return write_sequence(folder)
     if kind == "clouds":
         return write_pcd_folder(folder / "s", scans(2))
+    if kind == "velodyne_pcap":
+        pytest.importorskip("velodyne_decoder", reason="velodyne-decoder is not installed: lio-jax[pcap]")
+        return write_pcap(folder / "a.pcap", received(box(turns=1.0)))
+    if kind == "ouster_pcap":
+        pytest.importorskip(
+            "ouster.sdk", reason="ouster-sdk is not installed: pip install --no-deps ouster-sdk"
+        )
+        return write_capture(folder / "a.pcap", *frames(1))
     return bags.write_bag(folder / "a.bag", bag_messages(moving()[:2], ros2=False))
 
 
@@ -78,6 +88,7 @@ def test_fields_without_effect_are_named() -> None:
     assert detect.without_effect("kitti_odometry", config) == ["beams"]
     assert detect.without_effect("native", config) == ["vertical_correction_deg", "beams"]
     assert detect.without_effect("rosbag", config) == ["vertical_correction_deg"]
+    assert detect.without_effect("velodyne_pcap", config) == ["vertical_correction_deg", "beams"]
     assert detect.without_effect("memory", config) == []
 
 
