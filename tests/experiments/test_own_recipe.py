@@ -89,11 +89,18 @@ def test_it_is_ablated(drive, tmp_path):
 
 @pytest.mark.long
 def test_its_gradient_is_the_slope():
-    sequence = SimulatedSequence("street", "vlp16", 1.0, seed=1, imu=ImuModel())
+    sequence = SimulatedSequence("street", "vlp16", 2.0, seed=1, imu=ImuModel())
     settings = recipe_settings(NAME)
-    found = gradient(sequence, ["imu.gyro_noise"], "pose", settings)
-    assert np.isfinite(found.value)
-    assert np.isfinite(found.gradient["imu.gyro_noise"])
+    noise, step = settings.values["imu"]["gyro_noise"], 1e-3
+
+    def at(value):
+        moved = settings.with_value("params.imu.gyro_noise", value, "tried")
+        return gradient(sequence, ["imu.gyro_noise"], "pose", moved)
+
+    above, below = at((1 + step) * noise), at((1 - step) * noise)
+    # by the logarithm of the noise
+    slope = (above.value - below.value) / (2 * step)
+    assert at(noise).gradient["imu.gyro_noise"] == pytest.approx(slope, rel=0.02)
 
 
 @pytest.mark.long
