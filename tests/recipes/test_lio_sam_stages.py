@@ -134,7 +134,7 @@ def match(T_world_imu, used=True, lost=False, new_piece=False) -> MapMatch:
         iterations=jnp.int32(3),
         status=jnp.int32(LOST if lost else CONVERGED),
     )
-    return MapMatch(registration, T_world_imu, *map(jnp.array, (used, lost, new_piece)))
+    return MapMatch(registration, T_world_imu, *map(jnp.array, (used, lost, new_piece)), matched=None)
 
 
 def mapped(T_world_lidar=None) -> LioSamState:
