@@ -3,9 +3,10 @@
 import math
 from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Listing
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +41,6 @@ _REACH = {
 logarithm."""
 SHORTEST_SEGMENT = 20
 """Least number of scans of a segment: a shorter one shows the start only."""
-
-Held = TypeVar("Held")
 
 
 @dataclass(frozen=True)
@@ -119,35 +118,36 @@ def identity(problem: Problem) -> dict[str, Any]:
     }
 
 
-def taken_up(
-    path: Path, kind: str, own: Mapping[str, Any], read: Callable[[Path], tuple[Mapping[str, Any], Held]]
-) -> Held:
-    """Return what an interrupted tuning or training has left in a file.
+@contextmanager
+def taking_up(path: Path, kind: str, own: Mapping[str, Any]) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+    """Give a check of the identity in a file that an interrupted tuning or training has left.
+
+    Call it before the rest of the file is used. An error of reading within the block names the file.
 
     Args:
         path: of the file.
         kind: what it holds, such as ``training``.
         own: the identity of the problem which goes on.
-        read: gives the identity in a file, and the rest of it.
 
     Raises:
         UsageError: another problem has left it. The message names what differs.
         LioJaxError: it cannot be read, or lacks a part.
     """
+
+    def check(left: Mapping[str, Any]) -> None:
+        if other := [name for name, value in own.items() if left[name] != value]:
+            was = f" (it has {left['objective']})" if "objective" in other else ""
+            raise UsageError(
+                f"{path}: is the {kind} of another problem, with other {', '.join(other)}{was}; give another "
+                "--out, or --overwrite to begin anew."
+            )
+
     try:
-        identified, held = read(path)
-        other = [name for name, value in own.items() if identified[name] != value]
-        was = f" (it has {identified['objective']})" if "objective" in other else ""
+        yield check
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise LioJaxError(
             f"{path}: is no {kind} that can be continued ({error}); give --overwrite to begin anew."
         ) from None
-    if other:
-        raise UsageError(
-            f"{path}: is the {kind} of another problem, with other {', '.join(other)}{was}; give another "
-            "--out, or --overwrite to begin anew."
-        )
-    return held
 
 
 def problem_of(

@@ -17,7 +17,7 @@ from lio_jax.core.files import atomic_path
 from lio_jax.tuning.evaluated import Evaluated, validation_loss
 from lio_jax.tuning.objectives import nothing_counts, nothing_depends
 from lio_jax.tuning.optimise import Bounds, adam, fisher_scoring, lbfgsb, parameter_covariance, stationary
-from lio_jax.tuning.problem import Problem, identity, taken_up
+from lio_jax.tuning.problem import Problem, identity, taking_up
 from lio_jax.tuning.recording import Recording
 
 HISTORY = "history.json"
@@ -80,7 +80,7 @@ class Session:
         self._unit: NDArray[np.float64] | None = None
         self.history: list[Iterate] = []
         if self._path is not None and self._path.exists():
-            self.history = taken_up(self._path, "history", identity(problem), _read)
+            self._take_up(self._path)
 
     @property
     def best(self) -> Iterate:
@@ -179,11 +179,12 @@ class Session:
         with atomic_path(self._path) as aside:
             aside.write_text(json.dumps(held, indent=1) + "\n")
 
-
-def _read(path: Path) -> tuple[dict[str, Any], list[Iterate]]:
-    held = json.loads(path.read_text())
-    rows: list[dict[str, Any]] = [
-        {key: tuple(value) if isinstance(value, list) else value for key, value in one.items()}
-        for one in held["iterates"]
-    ]
-    return held["identity"], [Iterate(**row) for row in rows]
+    def _take_up(self, path: Path) -> None:
+        with taking_up(path, "history", identity(self._problem)) as check:
+            held = json.loads(path.read_text())
+            check(held["identity"])
+            rows: list[dict[str, Any]] = [
+                {key: tuple(value) if isinstance(value, list) else value for key, value in one.items()}
+                for one in held["iterates"]
+            ]
+            self.history = [Iterate(**row) for row in rows]

@@ -25,7 +25,7 @@ from lio_jax.settings.settings import Settings
 from lio_jax.tuning.evaluated import validation_loss
 from lio_jax.tuning.objectives import Objective, nothing_depends
 from lio_jax.tuning.optimise import Bounds, Moments
-from lio_jax.tuning.problem import Problem, identity, problem_of, taken_up
+from lio_jax.tuning.problem import Problem, identity, problem_of, taking_up
 
 TRAINING = "training.npz"
 _Vector = NDArray[np.float64]
@@ -126,9 +126,6 @@ def train(
     session = TrainingSession(problem, schedule or Schedule(), out)
     session.run(observer)
     return session.trained()
-
-
-_Held = tuple[NDArray[np.float64], NDArray[np.float64], Moments, list[float], int, list[Epoch]]
 
 
 class TrainingSession:
@@ -237,16 +234,14 @@ class TrainingSession:
             )
 
     def _take_up(self, path: Path) -> None:
-        held = taken_up(path, "training", self._identity(), self._read)
-        self._x, self._best_x, self._moments, self._losses, self._skipped, self.epochs = held
-
-    def _read(self, path: Path) -> tuple[dict[str, Any], _Held]:
-        held = read_arrays(path)
-        judged = bool(self._problem.validation)
-        epochs = [
-            Epoch(training, validation if judged else None, int(skipped))
-            for training, validation, skipped in held["epochs"].tolist()
-        ]
-        moments = Moments(held["mean"], held["square"], int(held["steps"]))
-        progress = (held["x"], held["best_x"], moments, held["losses"].tolist(), int(held["skipped"]), epochs)
-        return json.loads(str(held["identity"])), progress
+        with taking_up(path, "training", self._identity()) as check:
+            held = read_arrays(path)
+            check(json.loads(str(held["identity"])))
+            judged = bool(self._problem.validation)
+            self.epochs = [
+                Epoch(training, validation if judged else None, int(skipped))
+                for training, validation, skipped in held["epochs"].tolist()
+            ]
+            self._moments = Moments(held["mean"], held["square"], int(held["steps"]))
+            self._x, self._best_x = held["x"], held["best_x"]
+            self._losses, self._skipped = held["losses"].tolist(), int(held["skipped"])

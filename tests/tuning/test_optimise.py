@@ -270,6 +270,17 @@ def test_the_history_of_another_tuning_is_refused(tmp_path, changed, named):
         Session(problem(lambda x, recordings: noise_likelihood(x), **changed), tmp_path, 50)
 
 
+def test_the_history_of_another_tuning_is_refused_before_the_rest_is_read(tmp_path):
+    session(tmp_path).run("scoring", BEST + 1.5, WIDE, 1, 0)
+    held = json.loads((tmp_path / HISTORY).read_text())
+    (tmp_path / HISTORY).write_text(json.dumps(held | {"iterates": [{"of another version": 1}]}))
+    with pytest.raises(LioJaxError, match="is no history that can be continued"):
+        session(tmp_path)
+    other = problem(lambda x, recordings: noise_likelihood(x), training=(Drive("other"),))
+    with pytest.raises(UsageError, match="is the history of another problem, with other recordings"):
+        Session(other, tmp_path, 50)
+
+
 @pytest.mark.parametrize("written", ["", "[]", '{"names": []}', '{"identity": {}, "iterates": []}'])
 def test_a_history_that_cannot_be_read_is_named(tmp_path, written):
     (tmp_path / HISTORY).write_text(written)
