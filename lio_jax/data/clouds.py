@@ -19,13 +19,13 @@ from lio_jax.data.imu_text import read_imu_text
 from lio_jax.data.las_file import COMPRESSED_SUFFIX, DECOMPRESS
 from lio_jax.data.scan_reading import ScanReading, recognise_clouds
 from lio_jax.data.sequence import (
-    GpsData,
     ImuData,
     LidarScan,
     Reader,
+    SequenceBase,
     SequenceInfo,
-    WarningLog,
     entries,
+    scans_from,
 )
 from lio_jax.data.time_order import Stamped, ascending, in_time_order
 from lio_jax.data.trajectory import Trajectory, read_kitti_poses, read_tum
@@ -39,8 +39,8 @@ _LONGEST_IN_MM = 300_000.0
 """Median range above which points are in no frame of a lidar, mm."""
 
 
-class CloudFolder:
-    """A folder of .pcd, .ply, .npy, .bin or .las files."""
+class CloudFolder(SequenceBase):
+    """A folder of .pcd, .ply, .npy, .bin or .las files; it holds no GPS fixes."""
 
     def __init__(self, path: Path, config: DataConfig) -> None:
         """Order the files in time, and settle from the first clouds how they are read.
@@ -49,8 +49,8 @@ class CloudFolder:
             LioJaxError: files of several kinds or series, times that do not fit, no cloud that can be
                 read, or a field that is not there.
         """
+        super().__init__()
         self._path, self._config = path, config
-        self._log = WarningLog()
         self._stamps = self._find()
         self._notes = [self._stamps.note]
         self._reading, firsts = self._recognised()
@@ -68,11 +68,6 @@ class CloudFolder:
             notes=tuple(self._notes),
         )
 
-    @property
-    def warnings_so_far(self) -> tuple[str, ...]:
-        """Return one sentence for each problem met up to now."""
-        return self._log.sentences
-
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
         """Yield scans ``start`` to ``start + count`` in time order.
 
@@ -83,10 +78,6 @@ class CloudFolder:
     def imu(self) -> ImuData | None:
         """Return the samples of imu.csv or imu.txt, or None where there is no such file."""
         return self._imu
-
-    def gps(self) -> GpsData | None:
-        """Return None: a folder of clouds holds no fixes."""
-        return None
 
     def truth(self) -> Trajectory | None:
         """Return T_world_imu from a TUM file or from poses.txt; None where there is neither."""
@@ -171,8 +162,7 @@ class CloudFolder:
         return cloud_of(stamp_ns, points, fields)
 
     def _scans(self, start: int, count: int | None) -> Iterator[Stamped[LidarScan]]:
-        stop = None if count is None else start + count
-        chosen = slice(start, stop)
+        chosen = scans_from(start, count)
         for stamp_ns, file in zip(self._stamps.stamp_ns[chosen], self._stamps.files[chosen], strict=True):
             points = read_cloud(file, self._log.add)
             if points is None:

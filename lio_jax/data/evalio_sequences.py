@@ -11,14 +11,17 @@ import numpy as np
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data.config import DataConfig
 from lio_jax.data.evalio_points import scan_of
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo
+from lio_jax.data.sequence import ImuData, LidarScan, Reader, SequenceBase, SequenceInfo, scans_from
 from lio_jax.data.trajectory import Trajectory
 
 _PREFIX = "evalio:"
 
 
-class EvalioSequence:
-    """A sequence that evalio knows by a name such as ``newer_college_2020/short_experiment``."""
+class EvalioSequence(SequenceBase):
+    """A sequence that evalio knows by a name such as ``newer_college_2020/short_experiment``.
+
+    Evalio's loader has no fixes and reports no faults.
+    """
 
     def __init__(self, path: Path, config: DataConfig) -> None:
         """Find the sequence; no scan is read yet.
@@ -30,6 +33,7 @@ class EvalioSequence:
         Raises:
             LioJaxError: evalio is not installed, does not know the sequence, or has no data of it.
         """
+        super().__init__()
         name = str(path).removeprefix(_PREFIX)
         self._dataset = _dataset(name)
         lidar = self._dataset.lidar_params()
@@ -44,24 +48,15 @@ class EvalioSequence:
             notes=("scans, calibration and truth are those of evalio's loader",),
         )
 
-    @property
-    def warnings_so_far(self) -> tuple[str, ...]:
-        """Return nothing: evalio's loader reports no faults."""
-        return ()
-
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
         """Yield scans ``start`` to ``start + count``."""
-        stop = None if count is None else start + count
-        for measurement in islice(self._dataset.data_iter().lidar_iter(), start, stop):
+        chosen = scans_from(start, count)
+        for measurement in islice(self._dataset.data_iter().lidar_iter(), chosen.start, chosen.stop):
             yield scan_of(measurement, self._rate)
 
     def imu(self) -> ImuData | None:
         """Return all inertial samples."""
         return self._imu
-
-    def gps(self) -> GpsData | None:
-        """Return None: evalio has no fixes."""
-        return None
 
     def truth(self) -> Trajectory | None:
         """Return the pose of the IMU in the truth's world, or None where evalio has no truth."""

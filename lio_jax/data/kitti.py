@@ -15,7 +15,7 @@ from lio_jax.core.files import read_text
 from lio_jax.core.timestamps import FARTHEST_NS, seconds_to_ns
 from lio_jax.data.config import DataConfig
 from lio_jax.data.reconstruct import KITTI_START_AZIMUTH, azimuth_time
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
+from lio_jax.data.sequence import LidarScan, Reader, SequenceBase, SequenceInfo, scans_from
 from lio_jax.data.time_order import Stamped, ascending, in_time_order
 from lio_jax.data.trajectory import Trajectory, are_rigid, read_kitti_poses
 from lio_jax.data.velodyne_file import (
@@ -31,8 +31,8 @@ from lio_jax.data.velodyne_file import (
 )
 
 
-class KittiSequence:
-    """A folder ``sequences/NN`` with velodyne/*.bin, times.txt and calib.txt."""
+class KittiSequence(SequenceBase):
+    """A folder ``sequences/NN`` with velodyne/*.bin, times.txt and calib.txt; it has no IMU and no GPS."""
 
     def __init__(self, path: Path, config: DataConfig) -> None:
         """Open ``path`` without decoding scans.
@@ -40,9 +40,8 @@ class KittiSequence:
         Raises:
             LioJaxError: no scans, or a broken times.txt or calib.txt.
         """
-        self._path = path
-        self._config = config
-        self._log = WarningLog()
+        super().__init__()
+        self._path, self._config = path, config
         self._notes = ["no IMU in KITTI odometry: the body frame is the lidar frame"]
         files = numbered_files(path / "velodyne", [".bin"])
         if not files:
@@ -69,26 +68,12 @@ class KittiSequence:
             notes=tuple(self._notes),
         )
 
-    @property
-    def warnings_so_far(self) -> tuple[str, ...]:
-        """Return one sentence for each problem met up to now."""
-        return self._log.sentences
-
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
         """Yield scans: duration 0 if compensated, else a start half a sweep before the camera's stamp."""
-        stop = None if count is None else start + count
-        for number, path in self._files[start:stop]:
+        for number, path in self._files[scans_from(start, count)]:
             rows = read_returns(path, self._log.add)
             if rows is not None:
                 yield self._scan(self._stamps[number], rows)
-
-    def imu(self) -> ImuData | None:
-        """Return None: the odometry benchmark holds no inertial data."""
-        return None
-
-    def gps(self) -> GpsData | None:
-        """Return None: the odometry benchmark holds no fixes."""
-        return None
 
     def truth(self) -> Trajectory | None:
         """Return T_world_lidar = (P_0 Tr)^-1 P_i Tr, first pose identity; None without poses or calib.txt."""

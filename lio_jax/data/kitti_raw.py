@@ -15,7 +15,7 @@ from lio_jax.core.files import read_text
 from lio_jax.data.config import DataConfig
 from lio_jax.data.enu import geodetic_to_enu, mercator_positions
 from lio_jax.data.reconstruct import KITTI_START_AZIMUTH, azimuth_time
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
+from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceBase, SequenceInfo, scans_from
 from lio_jax.data.time_order import Stamped, ascending, in_time_order
 from lio_jax.data.trajectory import Trajectory, are_rigid
 from lio_jax.data.velodyne_file import (
@@ -162,7 +162,7 @@ class _Sweep:
     duration: float
 
 
-class KittiRawSequence:
+class KittiRawSequence(SequenceBase):
     """A drive folder with velodyne_points/ and oxts/."""
 
     def __init__(self, path: Path, config: DataConfig) -> None:
@@ -171,9 +171,8 @@ class KittiRawSequence:
         Raises:
             LioJaxError: no scans, or a broken timestamp or calibration file.
         """
-        self._path = path
-        self._config = config
-        self._log = WarningLog()
+        super().__init__()
+        self._path, self._config = path, config
         self._notes: list[str] = []
         self._compensated = config.compensated == "yes"
         velodyne = path / "velodyne_points"
@@ -204,15 +203,9 @@ class KittiRawSequence:
             notes=tuple(self._notes),
         )
 
-    @property
-    def warnings_so_far(self) -> tuple[str, ...]:
-        """Return one sentence for each problem met up to now."""
-        return self._log.sentences
-
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
         """Yield scans, stamped at their start; all points have time 0 if config declares them compensated."""
-        stop = None if count is None else start + count
-        for sweep in self._sweeps[start:stop]:
+        for sweep in self._sweeps[scans_from(start, count)]:
             rows = read_returns(sweep.path, self._log.add)
             if rows is None:
                 continue

@@ -17,9 +17,10 @@ from lio_jax.data.sequence import (
     ImuData,
     LidarScan,
     Reader,
+    SequenceBase,
     SequenceInfo,
-    WarningLog,
     check_still_there,
+    scans_from,
 )
 from lio_jax.data.time_order import Stamped, in_time_order
 from lio_jax.data.trajectory import Trajectory, are_rigid, read_tum
@@ -31,7 +32,7 @@ FORMAT_VERSION = 1
 """Format version that is written to meta.yaml, and the only one that is read."""
 
 
-class NativeSequence:
+class NativeSequence(SequenceBase):
     """A folder written by :func:`lio_jax.data.native_writer.write_native`."""
 
     def __init__(self, path: Path, config: DataConfig) -> None:
@@ -40,9 +41,9 @@ class NativeSequence:
         Raises:
             LioJaxError: a broken meta.yaml, another format version, or no scans.
         """
+        super().__init__()
         self._path = path
         self._compensated = config.compensated == "yes"
-        self._log = WarningLog()
         self._meta = _read_meta(path / "meta.yaml")
         files = numbered_files(path / "scans", [".npz"]) if (path / "scans").is_dir() else {}
         if not files:
@@ -70,15 +71,10 @@ class NativeSequence:
             else (),
         )
 
-    @property
-    def warnings_so_far(self) -> tuple[str, ...]:
-        """Return one sentence for each problem met up to now."""
-        return self._log.sentences
-
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
         """Yield scans by their numbers; unreadable and out-of-order scans are left out and reported."""
-        stop = None if count is None else start + count
-        read = ((path, self._load_scan(path)) for path in self._files[start:stop])
+        chosen = self._files[scans_from(start, count)]
+        read = ((path, self._load_scan(path)) for path in chosen)
         stamped = (Stamped(scan.stamp_ns, str(path), scan) for path, scan in read if scan is not None)
         yield from in_time_order(stamped, self._log.add)
 

@@ -13,7 +13,7 @@ from lio_jax.core.timestamps import FARTHEST_NS
 from lio_jax.data.cloud_fields import valid_returns
 from lio_jax.data.config import DataConfig
 from lio_jax.data.pcap_file import SUFFIXES, datagrams, first_datagrams, unknown_capture
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
+from lio_jax.data.sequence import ImuData, LidarScan, Reader, SequenceBase, SequenceInfo, scans_from
 from lio_jax.data.time_order import Stamped, in_time_order
 from lio_jax.data.trajectory import are_rigid
 
@@ -32,8 +32,11 @@ _INTENSITY = ("SIGNAL", "REFLECTIVITY")
 """Fields that are read as intensity: the first one that the sensor sends. Every profile has one of them."""
 
 
-class OusterPcap:
-    """A capture of one Ouster, with the file of its metadata beside it."""
+class OusterPcap(SequenceBase):
+    """A capture of one Ouster, with the file of its metadata beside it.
+
+    The sentences of a GPS receiver at the sensor are not read.
+    """
 
     def __init__(self, path: Path, config: DataConfig) -> None:
         """Find the metadata and the frames.
@@ -46,8 +49,8 @@ class OusterPcap:
             LioJaxError: the capture holds no frames of the sensor that the metadata describe, there are no
                 metadata, or the library is not installed.
         """
+        super().__init__()
         self._path = path
-        self._log = WarningLog()
         # the library says nothing of a capture that is truncated, damaged or none at all
         if not sum(1 for _ in datagrams(path, self._log.add)):
             raise unknown_capture(path)
@@ -76,11 +79,6 @@ class OusterPcap:
             ),
         )
 
-    @property
-    def warnings_so_far(self) -> tuple[str, ...]:
-        """Return one sentence for each problem met up to now."""
-        return self._log.sentences
-
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
         """Yield frames ``start`` to ``start + count``; one with a wrong stamp is left out with a warning."""
         yield from in_time_order(self._scans(start, count), self._log.add)
@@ -89,21 +87,14 @@ class OusterPcap:
         """Return the samples of the sensor's own IMU, or None where none were recorded."""
         return self._imu
 
-    def gps(self) -> GpsData | None:
-        """Return None: the sentences of a receiver at the sensor are not read."""
-        return None
-
-    def truth(self) -> None:
-        """Return None: a capture states no ground truth."""
-
     def _scans(self, start: int, count: int | None) -> Iterator[Stamped[LidarScan]]:
-        stop = len(self._frames) if count is None else min(start + count, len(self._frames))
-        if start >= stop:
+        numbers = range(len(self._frames))[scans_from(start, count)]
+        if not numbers:
             return
         # frames share one reader, so each pass needs its own; after a jump the library loses the first packet
         # of a frame if it came in fragments
         before = max(start - 1, 0)
-        for number, frames in enumerate(self._opened()[before:stop], before):
+        for number, frames in enumerate(self._opened()[before : numbers.stop], before):
             if number < start:
                 continue
             name = f"{self._path.name}: scan {number}"

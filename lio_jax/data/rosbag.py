@@ -30,9 +30,18 @@ from lio_jax.data.navigation_messages import GpsCollector, ImuCollector
 from lio_jax.data.part_recognition import recognise_messages
 from lio_jax.data.pointcloud2 import decode_cloud
 from lio_jax.data.scan_reading import ScanReading
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog, entries
+from lio_jax.data.sequence import (
+    GpsData,
+    ImuData,
+    LidarScan,
+    Reader,
+    SequenceBase,
+    SequenceInfo,
+    WarningLog,
+    entries,
+    scans_from,
+)
 from lio_jax.data.time_order import Stamped, in_time_order
-from lio_jax.data.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -43,7 +52,7 @@ _GPS_TYPES = {navigation_messages.FIX_TYPE: "a NavSatFix", navigation_messages.O
 _GPS_NAMES = ("gps", "gnss", "rtk")
 
 
-class RosbagSequence:
+class RosbagSequence(SequenceBase):
     """A bag, or a folder of the split bags of one recording.
 
     Each pass over the data opens the bag again, so one thread may decode scans while another asks for
@@ -56,9 +65,9 @@ class RosbagSequence:
         Raises:
             LioJaxError: no bag, a damaged bag, no point clouds, or a topic or field that is not in the bag.
         """
+        super().__init__()
         self._path, self._config = path, config
         self._paths = bag_paths(path)
-        self._warnings = WarningLog()
         self._samples: tuple[ImuData | None, GpsData | None] | None = None
         self._received: tuple[int | None, int | None] = (None, None)
         self._whole = self
@@ -87,11 +96,6 @@ class RosbagSequence:
             notes=tuple(self._notes),
         )
 
-    @property
-    def warnings_so_far(self) -> tuple[str, ...]:
-        """Return one sentence for each problem met up to now."""
-        return self._warnings.sentences
-
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
         """Yield scans ``start`` to ``start + count`` by their place in the bag; an empty scan has n = 0.
 
@@ -101,14 +105,14 @@ class RosbagSequence:
         if self._joining is not None:
             yield from self._joined(self._joining, start, count)
             return
-        yield from in_time_order(self._decoded(start, count), self._warnings.add)
+        yield from in_time_order(self._decoded(start, count), self._log.add)
 
     def _decoded(self, start: int, count: int | None) -> Iterator[Stamped[LidarScan]]:
-        stop = None if count is None else start + count
+        stop = scans_from(start, count).stop
         with open_bag(self._paths) as reader:
-            for number, cloud in self._clouds(reader, start, stop, self._warnings.add):
+            for number, cloud in self._clouds(reader, start, stop, self._log.add):
                 name = f"{self._path.name}: scan {number}"
-                scan = self._reading.scan(cloud, name, self._warnings.add)
+                scan = self._reading.scan(cloud, name, self._log.add)
                 yield Stamped(scan.stamp_ns, name, scan)
 
     def _joined(self, joining: Joining, start: int, count: int | None) -> Iterator[LidarScan]:
@@ -116,13 +120,11 @@ class RosbagSequence:
         if start >= len(firsts):
             return
         with open_bag(self._paths) as reader:
-            for number, parts in enumerate(
-                self._parts(reader, joining, firsts[start], self._warnings.add), start
-            ):
+            for number, parts in enumerate(self._parts(reader, joining, firsts[start], self._log.add), start):
                 if count is not None and number >= start + count:
                     return
                 whole = joining.whole([part.cloud for part in parts])
-                yield self._reading.scan(whole, f"{self._path.name}: scan {number}", self._warnings.add)
+                yield self._reading.scan(whole, f"{self._path.name}: scan {number}", self._log.add)
 
     def _first_messages(self) -> list[int]:
         """Return the number of the first message of each scan: a pass over all messages, once."""
@@ -167,7 +169,7 @@ class RosbagSequence:
         ``info.scan_count`` is still that of the whole bag.
         """
         part = copy(self)
-        part._received, part._samples, part._warnings = (start_ns, end_ns), None, WarningLog()
+        part._received, part._samples, part._log = (start_ns, end_ns), None, WarningLog()
         part._sweeps = None
         part._notes = list(self._notes)
         return part
@@ -176,7 +178,7 @@ class RosbagSequence:
         """Return what the bag's index and its first cloud state."""
         fields: tuple[str, ...] = ()
         with open_bag(self._paths) as reader:
-            for _, raw in self._lidar_messages(reader, self._warnings.add):
+            for _, raw in self._lidar_messages(reader, self._log.add):
                 if self._lidar.type in pointcloud2.LIVOX_TYPES:
                     fields = pointcloud2.custom_msg_field_names()
                 else:
@@ -197,7 +199,7 @@ class RosbagSequence:
     def header_stamps(self) -> Iterator[int]:
         """Yield the header stamp in ns of every cloud without decoding any."""
         with open_bag(self._paths) as reader:
-            for _, raw in self._lidar_messages(reader, self._warnings.add):
+            for _, raw in self._lidar_messages(reader, self._log.add):
                 yield read_header(raw, reader.is2).stamp_ns
 
     def imu(self) -> ImuData | None:
@@ -208,17 +210,13 @@ class RosbagSequence:
         """Return all GPS fixes, or None where there are none."""
         return self._read_samples()[1]
 
-    def truth(self) -> Trajectory | None:
-        """Return None: a bag states no ground truth."""
-        return None
-
     @property
     def _unit(self) -> str:
         """Return what a message is called in warnings."""
         return "scan" if self._joining is None else "message"
 
     def _damaged_topic(self, topic: str, reason: str) -> None:
-        self._warnings.add(f"{self._path}: {topic} is damaged ({reason}).")
+        self._log.add(f"{self._path}: {topic} is damaged ({reason}).")
 
     @property
     def _where(self) -> str:
@@ -305,7 +303,7 @@ class RosbagSequence:
 
     def _gather(self, topics: list[Topic]) -> tuple[ImuData | None, GpsData | None]:
         def broken(reason: str) -> None:
-            self._warnings.add(f"{self._path}: the bag is damaged ({reason}): IMU and GPS samples end there.")
+            self._log.add(f"{self._path}: the bag is damaged ({reason}): IMU and GPS samples end there.")
 
         with open_bag(self._paths) as reader:
             imu, gps = ImuCollector(reader.is2), GpsCollector()
@@ -327,15 +325,13 @@ class RosbagSequence:
                     unreadable[connection.topic] += 1
         for name, number in unreadable.items():
             if number:
-                self._warnings.add(
-                    f"{self._path}: {number} messages of {name} cannot be read and were skipped."
-                )
+                self._log.add(f"{self._path}: {number} messages of {name} cannot be read and were skipped.")
         return self._finished_imu(imu), self._finished_gps(gps)
 
     def _finished_imu(self, collector: ImuCollector) -> ImuData | None:
         imu, repairs = collector.imu()
         for repair in repairs:
-            self._warnings.add(f"{self._path}: {repair}")
+            self._log.add(f"{self._path}: {repair}")
         if imu is None:
             return None
         scale, note = accel_scale(imu.accel, self._config)

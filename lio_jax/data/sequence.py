@@ -139,6 +139,38 @@ class Sequence(Protocol):
         ...
 
 
+class SequenceBase:
+    """Reader of a recording with scans only: a format that holds more defines ``imu``, ``gps`` or ``truth``.
+
+    A reader adds its warnings to ``self._log``.
+    """
+
+    def __init__(self) -> None:
+        self._log = WarningLog()
+
+    def imu(self) -> ImuData | None:
+        """Return None: there are no inertial samples."""
+        return None
+
+    def gps(self) -> GpsData | None:
+        """Return None: there are no GPS fixes."""
+        return None
+
+    def truth(self) -> Trajectory | None:
+        """Return None: there is no ground truth."""
+        return None
+
+    @property
+    def warnings_so_far(self) -> tuple[str, ...]:
+        """Return one sentence for each problem met so far."""
+        return self._log.sentences
+
+
+def scans_from(start: int, count: int | None) -> slice:
+    """Return where the scans ``start`` to ``start + count`` stand in a list; a count of None: to the end."""
+    return slice(start, None if count is None else start + count)
+
+
 T = TypeVar("T")
 
 

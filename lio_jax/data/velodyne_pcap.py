@@ -14,7 +14,7 @@ import numpy as np
 from lio_jax.core.errors import LioJaxError, one_line
 from lio_jax.data.config import DataConfig
 from lio_jax.data.pcap_file import SUFFIXES, Datagram, datagrams, first_datagrams, unknown_capture
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceInfo, WarningLog
+from lio_jax.data.sequence import LidarScan, Reader, SequenceBase, SequenceInfo, scans_from
 from lio_jax.data.time_order import Stamped, in_time_order
 
 _SIZE = 1206
@@ -56,8 +56,11 @@ class _Turn(NamedTuple):
     last_azimuth: int
 
 
-class VelodynePcap:
-    """A capture of one Velodyne, whose scans are turns from straight ahead to straight ahead."""
+class VelodynePcap(SequenceBase):
+    """A capture of one Velodyne, whose scans are turns from straight ahead to straight ahead.
+
+    The position packets are not read: fixes, and the inertial samples of an HDL-32E.
+    """
 
     def __init__(self, path: Path, config: DataConfig) -> None:
         """Find the turns in one pass over the packets; decode the first of them.
@@ -69,8 +72,8 @@ class VelodynePcap:
         Raises:
             LioJaxError: the library is not installed, the model is not known, or no whole packet is there.
         """
+        super().__init__()
         self._path = path
-        self._log = WarningLog()
         self._library = _library(path)
         first = next(filter(_is_velodyne, first_datagrams(path)), None)
         if first is None:
@@ -95,30 +98,13 @@ class VelodynePcap:
             notes=(f"packets of a Velodyne {decoder.model_id.name}, cut straight ahead", clock),
         )
 
-    @property
-    def warnings_so_far(self) -> tuple[str, ...]:
-        """Return one sentence for each problem met up to now."""
-        return self._log.sentences
-
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
         """Yield scans ``start`` to ``start + count``; one with a wrong stamp is left out with a warning."""
         yield from in_time_order(self._scans(start, count), self._log.add)
 
-    def imu(self) -> ImuData | None:
-        """Return None: the inertial samples in the position packets of an HDL-32E are not read."""
-        return None
-
-    def gps(self) -> GpsData | None:
-        """Return None: the fixes in position packets are not read."""
-        return None
-
-    def truth(self) -> None:
-        """Return None: a capture states no ground truth."""
-
     def _scans(self, start: int, count: int | None) -> Iterator[Stamped[LidarScan]]:
         decoder = self._decoder()
-        stop = len(self._turns) if count is None else min(start + count, len(self._turns))
-        for number in range(start, stop):
+        for number in range(len(self._turns))[scans_from(start, count)]:
             name = f"{self._path.name}: scan {number}"
             try:
                 scan = self._decode(decoder, number)

@@ -17,8 +17,7 @@ from lio_jax.data.joined_messages import Grouping, Joining, Part, order_of
 from lio_jax.data.part_recognition import LOOKED_AT_NS, narrow, recognise_joining
 from lio_jax.data.point_time import TICK_NS, PointTiming
 from lio_jax.data.scan_reading import ScanReading
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
-from lio_jax.data.trajectory import Trajectory
+from lio_jax.data.sequence import ImuData, LidarScan, SequenceBase, SequenceInfo, scans_from
 from lio_jax.run.localise import check_no_known_map
 from lio_jax.run.run import settings_for
 from lio_jax.run.scan_inputs import ImuFeed, InputsInTurn, feed_of
@@ -159,25 +158,16 @@ class PushedOdometry:
         return results
 
 
-class _FirstScan:
+class _FirstScan(SequenceBase):
     """A recording of a single scan, from which settings are taken."""
 
     def __init__(self, scan: LidarScan, T_imu_lidar: NDArray[np.float64] | None) -> None:
+        super().__init__()
         self.info = SequenceInfo("pushed", "pushed", "pushed data", 1, T_imu_lidar)
-        self.warnings_so_far: tuple[str, ...] = ()
         self._scan = scan
 
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
-        yield from [self._scan][start : None if count is None else start + count]
-
-    def imu(self) -> ImuData | None:
-        return None
-
-    def gps(self) -> GpsData | None:
-        return None
-
-    def truth(self) -> Trajectory | None:
-        return None
+        yield from [self._scan][scans_from(start, count)]
 
 
 def rehearse(settings: Settings, scan: LidarScan, imu_rate: float) -> None:

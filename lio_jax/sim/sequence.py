@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lio_jax.core.errors import UsageError
-from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo
+from lio_jax.data.sequence import GpsData, ImuData, LidarScan, SequenceInfo, scans_from
 from lio_jax.data.trajectory import Trajectory
 from lio_jax.sim.city import city
 from lio_jax.sim.collision import STEP, TOGETHER, check_clear
@@ -184,8 +184,7 @@ class SimulatedSequence:
 
     def scans(self, start: int = 0, count: int | None = None) -> Iterator[LidarScan]:
         """Ray cast and yield scans ``start`` to ``start + count``."""
-        stop = self.info.scan_count if count is None else min(start + count, self.info.scan_count)
-        for number in range(start, stop):
+        for number in range(self.info.scan_count)[scans_from(start, count)]:
             yield self._scan(number)
 
     def imu(self) -> ImuData | None:
