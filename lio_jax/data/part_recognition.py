@@ -53,7 +53,8 @@ def recognise_messages(
         return None
     if wanted >= 2 or (wanted == 0 and narrow([cloud for cloud, _ in firsts])):
         taken = [cloud for cloud, _ in _of_a_second(chain(firsts, source))]
-        found = recognise_joining(taken, recognise_times(firsts, config), config, where)
+        each = recognise_times(firsts, config, called="message")
+        found = recognise_joining(taken, each, config, where)
         if found is not None:
             return found
     reading = recognise_clouds(firsts, config, where, known_whole=wanted == 1)
@@ -147,11 +148,9 @@ def _joined_reading(
     sweeps = grouped(parts, order_of(joining), True)
     wholes = [joining.whole([part.cloud for part in sweep]) for sweep in islice(sweeps, SCANS_LOOKED_AT)]
     beams, ring_notes = recognise_rings(wholes, config, where)
-    # what was recognised holds for one message
-    time_notes = [note.replace(" scan", " message") for note in each.notes]
     timing = joining.whole_timing()
     period = 0.0 if timing is None else joining.period
-    notes = (*time_notes, *ring_notes, _note(joining, config))
+    notes = (*each.notes, *ring_notes, _note(joining, config))
     return ScanReading(timing, "start", period, beams, notes)
 
 

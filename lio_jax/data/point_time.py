@@ -144,7 +144,12 @@ def scan_period(header_ns: Sequence[int], fallback: float) -> float:
 
 
 def recognise_point_time(
-    samples: Sequence[TimeSample], field: str, kind: str, config: DataConfig, stamped: bool = True
+    samples: Sequence[TimeSample],
+    field: str,
+    kind: str,
+    config: DataConfig,
+    stamped: bool = True,
+    called: str = "scan",
 ) -> PointTiming | None:
     """Settle the meaning of per-point times from the first scans; None where all times are equal.
 
@@ -154,6 +159,7 @@ def recognise_point_time(
         kind: its data type, for the note.
         config: overrides, and the scan period to use where there is only one scan.
         stamped: whether the header stamps are recorded; false where scans are only counted.
+        called: word for a cloud in the note: scan, or message where several are joined to a scan.
     """
     period = scan_period([sample.header_ns for sample in samples], config.scan_period)
     samples = _possible(samples)
@@ -168,28 +174,36 @@ def recognise_point_time(
     unit = config.time_unit if config.time_unit != "auto" else _unit(samples, spread, period, absolute)
     tick_ns = TICK_NS[unit]
     sweep = spread * tick_ns * 1e-9
-    anchor, where = _anchor(samples, tick_ns, absolute, sweep, config, stamped)
+    anchor, where = _anchor(samples, tick_ns, absolute, sweep, config, stamped, called)
     note = (
         f"per-point time: field {field!r}, {kind} {unit} {'absolute' if absolute else 'relative'}, "
-        f"{sweep:.4f} s a scan, {where}"
+        f"{sweep:.4f} s a {called}, {where}"
     )
     if not 0.1 <= sweep / period <= 2.0:
-        note += f"; that does not fit the {period:.4g} s between scans, check config.data.time_unit"
+        note += f"; that does not fit the {period:.4g} s between {called}s, check config.data.time_unit"
     return PointTiming(tick_ns, absolute, anchor, sweep, note)
 
 
 def stamp_end(
-    samples: Sequence[TimeSample], sweep: float, config: DataConfig
+    samples: Sequence[TimeSample], sweep: float, config: DataConfig, called: str
 ) -> tuple[Literal["start", "end"], str]:
-    """Return which end of a scan header stamps mark, where points do not state it, and the evidence."""
+    """Return which end of a scan header stamps mark, where points do not state it, and the evidence.
+
+    Args:
+        samples: time samples of several consecutive scans, at least one.
+        sweep: usual duration of a scan, s.
+        config: says what stamps mark, or leaves it to the evidence.
+        called: word for a cloud in the evidence: scan, or message where several are joined to a scan.
+    """
+    stamp = f"header stamp at {called}"
     if config.stamp_at != "auto":
-        return config.stamp_at, f"header stamp at scan {config.stamp_at} (config.data.stamp_at)"
+        return config.stamp_at, f"{stamp} {config.stamp_at} (config.data.stamp_at)"
     latency = np.array([sample.received_ns - sample.header_ns for sample in samples]) * 1e-9
     if latency.min() > _CLEARLY_RECEIVED_LATER and latency.max() < 0.9 * sweep:
-        return "end", f"header stamp at scan end (received {np.median(latency):.3f} s after it)"
+        return "end", f"{stamp} end (received {np.median(latency):.3f} s after it)"
     if latency.min() >= 0.9 * sweep and latency.max() < _LONGEST_LATENCY:
-        return "start", "header stamp at scan start"
-    return "start", "header stamp at scan start (assumed; config.data.stamp_at=end otherwise)"
+        return "start", f"{stamp} start"
+    return "start", f"{stamp} start (assumed; config.data.stamp_at=end otherwise)"
 
 
 def _is_absolute(samples: Sequence[TimeSample], spread: float) -> bool:
@@ -223,33 +237,34 @@ def _anchor(
     sweep: float,
     config: DataConfig,
     stamped: bool,
+    called: str,
 ) -> tuple[Literal["points", "start", "end", "inside"], str]:
     if absolute and not stamped:
-        return "points", "these times place the scans, instead of counted stamps"
+        return "points", f"these times place the {called}s, instead of counted stamps"
     if config.stamp_at != "auto":
-        return stamp_end(samples, sweep, config)
+        return stamp_end(samples, sweep, config, called)
     if absolute:
         # Place of the header in the scan on the points' own clock: 0 is its start, 1 its end.
         offsets = [(s.header_ns - ticks_to_ns(s.low, tick_ns)) * 1e-9 for s in samples]
         place = float(np.median(offsets)) / sweep
         if -1.0 < place < 2.0:
-            word = (
-                "start"
+            where = (
+                f"{called} start"
                 if abs(place) < 0.1
-                else "end"
+                else f"{called} end"
                 if abs(place - 1.0) < 0.1
-                else f"{place:.2f} of the scan"
+                else f"{place:.2f} of the {called}"
             )
-            return "points", f"header stamp at {'scan ' if word in ('start', 'end') else ''}{word}"
-        anchor, note = stamp_end(samples, sweep, config)
+            return "points", f"header stamp at {where}"
+        anchor, note = stamp_end(samples, sweep, config, called)
         return anchor, f"{note}, points on another clock than the header ({np.median(offsets):+.3f} s)"
     low = float(np.median([s.low for s in samples])) * tick_ns * 1e-9
     high = float(np.median([s.high for s in samples])) * tick_ns * 1e-9
     if low < -0.02 * sweep:
         if high <= 0.1 * sweep:
-            return "end", "header stamp at scan end (times are negative)"
-        return "inside", f"header stamp {-low:.3f} s into the scan (times of both signs)"
-    return stamp_end(samples, sweep, config)
+            return "end", f"header stamp at {called} end (times are negative)"
+        return "inside", f"header stamp {-low:.3f} s into the {called} (times of both signs)"
+    return stamp_end(samples, sweep, config, called)
 
 
 def _possible(samples: Sequence[TimeSample]) -> list[TimeSample]:

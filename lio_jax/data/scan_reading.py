@@ -117,7 +117,10 @@ def recognise_clouds(
 
 
 def recognise_times(
-    clouds: Sequence[tuple[RawCloud, int]], config: DataConfig, stamped: bool = True
+    clouds: Sequence[tuple[RawCloud, int]],
+    config: DataConfig,
+    stamped: bool = True,
+    called: str = "scan",
 ) -> ScanReading:
     """Settle how clouds state their times; the number of beams is left open.
 
@@ -125,6 +128,7 @@ def recognise_times(
         clouds: at least one cloud with the time of its receipt, ns, in recorded order.
         config: settings that override what is recognised.
         stamped: whether the clouds' stamps are recorded.
+        called: word for a cloud in the note: scan, or message where several are joined to a scan.
     """
     if config.compensated == "yes":
         note = "points are taken as motion compensated to the header stamp (config.data.compensated)"
@@ -136,13 +140,17 @@ def recognise_times(
     ]
     kind = next((c.time.dtype.name for c, _ in reversed(with_points) if c.time is not None), "")
     field = _first_with_points([cloud for cloud, _ in clouds]).time_field
-    timing = recognise_point_time(samples, field, kind, config, stamped) if kind else None
+    timing = recognise_point_time(samples, field, kind, config, stamped, called) if kind else None
     if timing is not None:
         return ScanReading(timing, "start", timing.sweep, 0, (timing.note,))
     period = scan_period([sample.header_ns for sample in samples], config.scan_period)
-    stamp_at, note = stamp_end(samples, period, config) if samples else ("start", "no points in any cloud")
+    stamp_at, note = (
+        stamp_end(samples, period, config, called) if samples else ("start", "no points in any cloud")
+    )
     missing = f"field {field!r} holds a single value" if field else "not recorded"
-    time_note = f"per-point time: {missing}, reconstructed from azimuth over {period:.4g} s a scan, {note}"
+    time_note = (
+        f"per-point time: {missing}, reconstructed from azimuth over {period:.4g} s a {called}, {note}"
+    )
     return ScanReading(None, stamp_at, period, 0, (time_note,))
 
 

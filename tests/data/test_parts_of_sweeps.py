@@ -64,6 +64,9 @@ def test_parts_are_joined_to_the_scans_of_whole_sweeps(tmp_path: Path, driver: s
         "each message holds a part of a turn: 5 messages are joined to a scan of 0.1 s, which starts at 0 "
         "deg of azimuth; --set config.data.messages_per_scan=1 reads each message as a scan"
     )
+    (times,) = (note for note in sequence.info.notes if note.startswith("per-point time"))
+    assert "s a message, header stamp at message " in times
+    assert "scan" not in times
     scans = list(expected.scans())
     check_same(list(sequence.scans()), scans, ulps)
     assert sequence.info.scan_count == len(scans) == 12

@@ -85,6 +85,8 @@ def test_relative_times_of_every_unit(unit: str, kind: str, scans: int) -> None:
         == f"per-point time: field 't', kind {unit} relative, 0.0990 s a scan, header stamp at scan start"
     )
     assert _starts(timing, samples, times) == [0] * scans
+    of_a_part = recognise_point_time(samples, "t", "kind", AUTO, called="message")
+    assert of_a_part == replace(timing, note=timing.note.replace(" scan", " message"))
 
 
 @pytest.mark.parametrize(
