@@ -6,8 +6,6 @@ from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from lio_jax.core.errors import LioJaxError
 from lio_jax.data import navigation_messages, pointcloud2
 from lio_jax.data.bag_extrinsic import bag_extrinsic
@@ -22,6 +20,7 @@ from lio_jax.data.bag_files import (
     read_header,
     until_damage,
 )
+from lio_jax.data.clock_difference import clock_difference
 from lio_jax.data.cloud_fields import RawCloud
 from lio_jax.data.config import DataConfig
 from lio_jax.data.imu_checks import accel_scale
@@ -341,29 +340,24 @@ class RosbagSequence(SequenceBase):
         return ImuData(imu.stamp_ns + shift_ns, imu.gyro, imu.accel * scale, imu.orientation)
 
     def _clock_difference(self) -> int:
-        """Return by how much the lidar's clock is ahead of the IMU's, ns; 0 up to a second.
-
-        Where a scan is received, the last sample received before it was taken at the scan's end: FAST-LIO2's
-        time_sync_en, here with the median of some scans.
-        """
-        last, differences = None, []
+        """Return by how much the lidar's clock is ahead of the IMU's, ns, and note it."""
         with open_bag(self._paths) as reader:
-            topics = [self._lidar] if self._imu_topic is None else [self._lidar, self._imu_topic]
-            for connection, _, raw in until_damage(self._messages(reader, *topics), lambda reason: None):
-                # damaged messages are reported where they are read
-                with suppress(ValueError):
-                    if connection.topic != self._lidar.name:
-                        last = read_header(raw, reader.is2).stamp_ns
-                    elif last is not None:
-                        cloud = decode_cloud(reader, self._lidar, raw, self._config.time_field, self._where)
-                        end_ns = self._reading.scan(cloud, "", lambda sentence: None).end_ns
-                        differences.append(end_ns - last)
-                if len(differences) == _CLOCK_SCANS:
-                    break
-        difference = round(float(np.median(differences))) if differences else 0
-        if abs(difference) <= _CLOCKS_DIFFER_NS:
-            return 0
-        self._notes.append(f"imu: {difference * 1e-9:+.3f} s were added to its stamps, to align the clocks")
+
+            def scan_end_ns(raw: bytes) -> int:
+                cloud = decode_cloud(reader, self._lidar, raw, self._config.time_field, self._where)
+                return self._reading.scan(cloud, "", lambda sentence: None).end_ns
+
+            topics = [topic for topic in (self._lidar, self._imu_topic) if topic is not None]
+            messages = until_damage(self._messages(reader, *topics), lambda reason: None)
+            difference = clock_difference(
+                ((connection.topic == self._lidar.name, raw) for connection, _, raw in messages),
+                scan_end_ns,
+                lambda raw: read_header(raw, reader.is2).stamp_ns,
+            )
+        if difference:
+            self._notes.append(
+                f"imu: {difference * 1e-9:+.3f} s were added to its stamps, to align the clocks"
+            )
         return difference
 
     def _finished_gps(self, collector: GpsCollector) -> GpsData | None:
@@ -376,12 +370,6 @@ class RosbagSequence(SequenceBase):
         connections = [c for c in reader.connections if (c.topic, c.msgtype) in wanted]
         start, stop = self._received
         return reader.messages(connections, start=start, stop=stop)
-
-
-_CLOCK_SCANS = 10
-"""Number of scans whose stamps are compared with those of the samples received before them."""
-_CLOCKS_DIFFER_NS = 1_000_000_000
-"""Clocks that differ by less are left as they are, ns."""
 
 
 def _size(path: Path) -> int:
