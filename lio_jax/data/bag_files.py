@@ -1,7 +1,7 @@
 """The files and topics of a bag, and the parts of a ROS message that all readers share."""
 
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,49 +90,6 @@ def bag_topics(connections: Iterable[Any]) -> tuple[Topic, ...]:
         key = (connection.topic, connection.msgtype)
         counts[key] = counts.get(key, 0) + connection.msgcount
     return tuple(Topic(*key, count) for key, count in sorted(counts.items()))
-
-
-def choose_topic(
-    path: Path, topics: tuple[Topic, ...], key: str, wanted: str, types: Mapping[str, str]
-) -> tuple[Topic | None, str]:
-    """Return the topic to read, and a note if other topics could have been read.
-
-    Args:
-        path: path of the bag, for messages.
-        topics: all topics of the bag.
-        key: key of the setting that names the topic, for example "lidar_topic".
-        wanted: value of that setting; "" takes the topic with the most messages among those of the right
-            type.
-        types: name in messages of each accepted message type.
-
-    Raises:
-        LioJaxError: ``wanted`` is not in the bag, or is of another type.
-    """
-    fitting = [topic for topic in topics if topic.type in types]
-    if wanted:
-        named = [topic for topic in topics if topic.name.strip("/") == wanted.strip("/")]
-        if not named:
-            raise LioJaxError(
-                f"{path}: config.data.{key}={wanted!r} is not in the bag; its topics are {listed(topics)}."
-            )
-        chosen = next((topic for topic in named if topic.type in types), None)
-        if chosen is None:
-            expected = " or ".join(dict.fromkeys(types.values()))
-            raise LioJaxError(
-                f"{path}: config.data.{key}={wanted!r} is {named[0].type}, not {expected}; "
-                f"topics of that kind are {listed(fitting) or 'not in the bag'}."
-            )
-        return chosen, ""
-    if not fitting:
-        return None, ""
-    chosen = max(fitting, key=lambda topic: topic.count)
-    others = [topic for topic in fitting if topic is not chosen]
-    if not others:
-        return chosen, ""
-    return chosen, (
-        f"topic {chosen.name} was taken ({chosen.count} messages); there is also {listed(others)}: "
-        f"choose with --set config.data.{key}={others[0].name}"
-    )
 
 
 def listed(topics: Iterable[Topic]) -> str:

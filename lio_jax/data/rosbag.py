@@ -7,15 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.data import navigation_messages, pointcloud2
+from lio_jax.data import pointcloud2
 from lio_jax.data.bag_extrinsic import bag_extrinsic
 from lio_jax.data.bag_files import (
     BagContents,
     Topic,
     bag_paths,
     bag_topics,
-    choose_topic,
-    listed,
     open_bag,
     read_header,
     until_damage,
@@ -41,14 +39,10 @@ from lio_jax.data.sequence import (
     scans_from,
 )
 from lio_jax.data.time_order import Stamped, in_time_order
+from lio_jax.data.topics import topics_to_read
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
-
-_LIDAR_TYPES = dict.fromkeys((pointcloud2.TYPE, *sorted(pointcloud2.LIVOX_TYPES)), "a point cloud")
-_IMU_TYPES = {navigation_messages.TYPE: "an Imu"}
-_GPS_TYPES = {navigation_messages.FIX_TYPE: "a NavSatFix", navigation_messages.ODOMETRY_TYPE: "an Odometry"}
-_GPS_NAMES = ("gps", "gnss", "rtk")
 
 
 class RosbagSequence(SequenceBase):
@@ -73,15 +67,13 @@ class RosbagSequence(SequenceBase):
         self._sweeps: list[int] | None = None
         with open_bag(self._paths) as reader:
             topics = bag_topics(reader.connections)
-            self._notes = [f"{len(self._paths)} files read as one recording"] if len(self._paths) > 1 else []
-            self._lidar = self._choose_lidar(topics)
-            self._imu_topic = self._choose("imu_topic", config.imu_topic, topics, _IMU_TYPES)
-            self._gps_topic = self._choose_gps(topics)
+            self._lidar, self._imu_topic, self._gps_topic, chosen = topics_to_read(path, topics, config)
             self._reading, self._joining = self._recognised(reader)
             self._T_imu_lidar, tied = bag_extrinsic(
                 reader, topics, self._imu_topic, self._lidar, self._damaged_topic
             )
-        self._notes += [*([tied] if tied else []), *self._reading.notes]
+        pieces = [f"{len(self._paths)} files read as one recording"] if len(self._paths) > 1 else []
+        self._notes = [*pieces, *chosen, *([tied] if tied else []), *self._reading.notes]
 
     @property
     def info(self) -> SequenceInfo:
@@ -221,27 +213,6 @@ class RosbagSequence(SequenceBase):
     def _where(self) -> str:
         return f"{self._path}: topic {self._lidar.name}"
 
-    def _choose(
-        self, key: str, wanted: str, topics: tuple[Topic, ...], types: dict[str, str]
-    ) -> Topic | None:
-        chosen, note = choose_topic(self._path, topics, key, wanted, types)
-        if note:
-            self._notes.append(f"{key.removesuffix('_topic')}: {note}")
-        return chosen
-
-    def _choose_lidar(self, topics: tuple[Topic, ...]) -> Topic:
-        lidar = self._choose("lidar_topic", self._config.lidar_topic, topics, _LIDAR_TYPES)
-        if lidar is None:
-            raise LioJaxError(
-                f"{self._path}: no topic holds point clouds (PointCloud2 or Livox CustomMsg); "
-                f"its topics are {listed(topics) or 'none'}."
-            )
-        if not lidar.count:
-            raise LioJaxError(
-                f"{self._path}: topic {lidar.name} holds no messages; record or choose another."
-            )
-        return lidar
-
     def _recognised(self, reader: "AnyReader") -> tuple[ScanReading, Joining | None]:
         """Settle from the topic's first clouds with points how its clouds are read and joined."""
         undecoded: list[str] = []
@@ -264,20 +235,6 @@ class RosbagSequence(SequenceBase):
                 f"{self._where}: no point cloud can be read{reason}; the recording is empty or damaged there."
             )
         return found
-
-    def _choose_gps(self, topics: tuple[Topic, ...]) -> Topic | None:
-        """Take an Odometry as GPS only if asked for or named so: most are the output of an estimator."""
-        if self._config.gps_topic:
-            return self._choose("gps_topic", self._config.gps_topic, topics, _GPS_TYPES)
-        fixes = tuple(topic for topic in topics if topic.type == navigation_messages.FIX_TYPE)
-        odometry = tuple(topic for topic in topics if topic.type == navigation_messages.ODOMETRY_TYPE)
-        named = tuple(topic for topic in odometry if any(word in topic.name.lower() for word in _GPS_NAMES))
-        if odometry and not (fixes or named):
-            self._notes.append(
-                f"gps: none; {odometry[0].name} (Odometry) is used as GPS with "
-                f"--set config.data.gps_topic={odometry[0].name}"
-            )
-        return self._choose("gps_topic", "", fixes or named, _GPS_TYPES)
 
     def _lidar_messages(
         self, reader: "AnyReader", warn: Callable[[str], None]
