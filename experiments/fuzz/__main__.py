@@ -1,4 +1,7 @@
-"""``python -m experiments.fuzz``: run a campaign and print its table; exit status 1 if anything failed."""
+"""``python -m experiments.fuzz``: run a campaign and print its table.
+
+The exit status is 1 if anything failed, and 2 if the campaign cannot run.
+"""
 
 import argparse
 import sys
@@ -6,6 +9,7 @@ from pathlib import Path
 
 from experiments.fuzz.campaign import run_campaign
 from experiments.fuzz.kinds import KINDS
+from lio_jax.core.errors import LioJaxError
 
 
 def main() -> int:
@@ -16,7 +20,11 @@ def main() -> int:
     parser.add_argument("--kinds", nargs="*", default=[], choices=[kind.name for kind in KINDS])
     parser.add_argument("--work", type=Path, default=Path("out/fuzz"), help="seeds, and failures in kept/")
     options = parser.parse_args()
-    campaign = run_campaign(options.work, options.inputs, options.seed, tuple(options.kinds), show=True)
+    try:
+        campaign = run_campaign(options.work, options.inputs, options.seed, tuple(options.kinds), show=True)
+    except LioJaxError as error:
+        print(f"fuzz: {error}", file=sys.stderr)
+        return 2
     print(campaign.table())
     return 1 if campaign.failures else 0
 

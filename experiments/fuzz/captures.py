@@ -4,9 +4,12 @@ import json
 import struct
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from ouster.sdk import core
+
+from lio_jax.core.errors import LioJaxError
+from lio_jax.data.ouster_pcap import INSTALL
 
 _PERIOD_NS = 100_000_000
 _TURNS, _PACKETS = 4, 10
@@ -18,14 +21,18 @@ def write_captures(root: Path, start_ns: int) -> None:
     Args:
         root: folder that does not exist yet.
         start_ns: time of the first packet, ns.
+
+    Raises:
+        LioJaxError: the library of Ouster captures is not installed.
     """
+    core = _ouster_core()
     for name in ("velodyne", "ouster"):
         (root / name).mkdir(parents=True)
     _write(root / "velodyne" / "a.pcap", _velodyne(start_ns))
     described = json.loads(core.SensorInfo.from_default(core.LidarMode._512x10).to_json_string())
     described["config_params"] |= {"udp_port_lidar": 7502, "udp_port_imu": 7503}
     (root / "ouster" / "a.json").write_text(json.dumps(described))
-    _write(root / "ouster" / "a.pcap", _ouster(json.dumps(described), start_ns))
+    _write(root / "ouster" / "a.pcap", _ouster(core, json.dumps(described), start_ns))
 
 
 def _velodyne(start_ns: int) -> Iterable[tuple[int, int, bytes]]:
@@ -39,7 +46,18 @@ def _velodyne(start_ns: int) -> Iterable[tuple[int, int, bytes]]:
         yield stamp_ns, 2368, data + struct.pack("<IBB", stamp_ns // 1000 % 3_600_000_000, 0x37, 0x22)
 
 
-def _ouster(described: str, start_ns: int) -> Iterable[tuple[int, int, bytes]]:
+def _ouster_core() -> Any:
+    try:
+        from ouster.sdk import core
+    except ImportError:
+        raise LioJaxError(
+            "the campaign writes captures of an Ouster by ouster-sdk 1.0 or newer, which is not installed; "
+            f"install it with {INSTALL}."
+        ) from None
+    return core
+
+
+def _ouster(core: Any, described: str, start_ns: int) -> Iterable[tuple[int, int, bytes]]:
     """Yield the packets of two frames, and a sample of the IMU with each."""
     info = core.SensorInfo(described)
     for number in range(2):

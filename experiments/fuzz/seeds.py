@@ -111,12 +111,15 @@ def write_seeds(root: Path, run: Run, with_run: bool) -> None:
 
     Raises:
         RuntimeError: a command failed on a healthy file.
+        LioJaxError: the library of Ouster captures is not installed.
     """
 
     def must(*words: object) -> None:
         if run([str(word) for word in words]):
             raise RuntimeError(f"failed on a healthy file: lio-jax {' '.join(map(str, words))}")
 
+    # first, because it needs a library that may be missing
+    write_captures(root / "captures", START_NS)
     native = root / "native" / "drive"
     write_native(
         native,
@@ -144,7 +147,6 @@ def write_seeds(root: Path, run: Run, with_run: bool) -> None:
     must("export", native, "--to", "kitti", "--out", root / "kitti" / "04")
     _write_kitti_raw(root / "kitti_raw" / "day")
     _write_clouds(root / "clouds")
-    write_captures(root / "captures", START_NS)
     _write_texts(root)
     (root / "native" / "my.yaml").write_text(SETTINGS)
     (root / "rest").mkdir()

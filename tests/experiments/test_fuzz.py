@@ -1,6 +1,7 @@
 """The fuzz campaign: a short one finds nothing, and its judge, its watch and its shortening work."""
 
 import os
+import sys
 from io import BytesIO
 from pathlib import Path
 from random import Random
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.fuzz import campaign
+from experiments.fuzz.__main__ import main
 from experiments.fuzz.campaign import Failure, Trial, Worker, failure_from_json, run_campaign, signature
 from experiments.fuzz.edits import ARRAY_ACTIONS, VALUE_ACTIONS, Edit
 from experiments.fuzz.kinds import KINDS
@@ -166,3 +168,10 @@ def test_actions_that_keep_the_form_of_an_array():
         changed = ARRAY_ACTIONS[action](np.arange(20.0).reshape(10, 2))
         assert changed is not None
         assert (changed.shape, changed.dtype) == ((10, 2), np.float64)
+
+
+def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ouster.sdk", None)
+    monkeypatch.setattr(sys, "argv", ["fuzz", "--inputs", "2", "--work", str(tmp_path)])
+    assert main() == 2
+    assert "install it with pip install --no-deps 'ouster-sdk" in capsys.readouterr().err
