@@ -16,35 +16,24 @@ stochastic mapping using the joint compatibility test", T-RA 2001, and of Latif,
 closing over time for pose graph SLAM", IJRR 2013. The order by the chance of a false agreement is our own.
 """
 
-from contextlib import suppress
-from dataclasses import dataclass
-from functools import cached_property
 from math import ceil
-from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln
 from scipy.stats import chi2
 
-from lio_jax.pose_graph.chordal import chordal_poses, edges_at
-from lio_jax.pose_graph.descent import (
-    Descent,
-    Limits,
-    Padded,
-    descend,
-    padded_poses,
-    padded_weights,
-    point_at,
-    restricted,
-)
-from lio_jax.pose_graph.factors import residuals
-from lio_jax.pose_graph.graph import PoseGraph, Poses, picked
+from lio_jax.pose_graph.descent import Descent, Limits, Padded
+from lio_jax.pose_graph.graph import PoseGraph, Poses
 from lio_jax.pose_graph.leave_one_out import falls_without
+from lio_jax.pose_graph.loop_innovations import (
+    Accepted,
+    DoubtedGraph,
+    Innovations,
+    innovations_of,
+    solved_with,
+)
 from lio_jax.pose_graph.multifrontal import NotPositiveDefiniteError
-from lio_jax.pose_graph.path_covariance import path_covariances
 from lio_jax.pose_graph.structure import Structure, structure_of
 
 _Array = NDArray[np.float64]
@@ -76,18 +65,12 @@ _ON_THE_WAY = Limits(iterations=50, tolerance=1e-4)
 """Conditions that end the descents before the last one."""
 _WORST = 0.25
 """Loops are dropped together if their residual is above this share of the largest."""
-_FARTHEST = 1e9
-"""Largest residual that is distinguished from others, m."""
-_FALSE_LOOPS = 4096
-"""Number of drawn false loops whose residuals state how a wrong loop scatters."""
 _STATED = 60.0
 """Degrees of freedom with which the stated information counts in the estimate of the noise."""
 _HALVINGS = 24
 """Number of variances of the noise that are compared in the first round, each half of the one before."""
 _ALMOST_ALL = 0.9
 """Share of the right loops that agree with the variance of the first round."""
-_OPEN = 1e-12
-"""Least eigenvalue of an information matrix, over its largest, that counts as information."""
 _TRIALS = 10
 """Largest number of loops that are tried for the sake of others."""
 _TRIED = 0.05
@@ -126,91 +109,28 @@ def select(
         The last descent, with the count of iterations of all descents, and the (e,) weight of each edge: 1 if
         it agrees, else 0.
     """
-    problem = _Problem(graph, structure, padded, doubted, confidence)
-    state = _State(~doubted, poses, 1.0, 0)
+    problem = DoubtedGraph(graph, structure, padded, doubted, confidence)
+    state = Accepted(~doubted, poses, 1.0, 0)
     few = np.sum(doubted) <= _FEW * np.sum(~doubted)
     # a damaged file may place vertices beyond all numbers
     with np.errstate(over="ignore", invalid="ignore"):
         state = _of_few(problem, state) if few else _of_many(problem, state)
-    descent = _solved(problem, state.kept, state.poses, limits, anew=False)
+    descent = solved_with(problem, state.kept, state.poses, limits, anew=False)
     iterations = state.iterations + descent.iterations
     return descent._replace(iterations=iterations), state.kept.astype(np.float64)
 
 
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    graph: PoseGraph
-    structure: Structure
-    padded: Padded
-    doubted: NDArray[np.bool_]
-    confidence: float
-
-    @property
-    def size(self) -> int:
-        return self.structure.tangent_size
-
-    @cached_property
-    def limit(self) -> float:
-        return float(chi2.ppf(self.confidence, self.size))
-
-    @cached_property
-    def covariance(self) -> _Array:
-        values, vectors = np.linalg.eigh(np.asarray(self.graph.information, np.float64))
-        # a direction without information is open, not exact
-        values = np.maximum(values, np.maximum(_OPEN * values[:, -1:], np.finfo(np.float64).tiny ** 0.5))
-        return (vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1)
-
-    @cached_property
-    def false_loops(self) -> PoseGraph:
-        """Doubted measurements between vertices that are drawn at random."""
-        rng = np.random.default_rng(0)
-        drawn = edges_at(self.graph, rng.choice(np.flatnonzero(self.doubted), _FALSE_LOOPS))
-        ends = rng.integers(0, len(self.structure.held), (2, _FALSE_LOOPS)).astype(self.structure.i.dtype)
-        return eqx.tree_at(lambda graph: (graph.i, graph.j), drawn, (ends[0], ends[1]))
-
-
-class _State(NamedTuple):
-    kept: NDArray[np.bool_]
-    """(e,) accepted edges."""
-    poses: Poses
-    """Their solution, at the padded size."""
-    variance: float
-    """Variance of the noise, over the stated one."""
-    iterations: int
-
-
-class _Innovations(NamedTuple):
-    squared: _Array
-    """(k,) r' S^-1 r of each loop."""
-    S: _Array
-    """(k, d, d) covariances of the residuals."""
-    false: _Array
-    """(d, d) second moment of the residuals of false loops."""
-
-    def chance(self, limit: float, variance: float) -> _Array:
-        """Return the (k,) probabilities that a false loop, normally distributed, has r' S^-1 r below a limit.
-
-        The density is taken to be that at zero, which is right for small probabilities.
-        """
-        size = len(self.false)
-        volume = size / 2 * np.log(limit / 2) - gammaln(size / 2 + 1)
-        S = variance * self.S
-        among = np.linalg.slogdet(S)[1] - np.linalg.slogdet(S + self.false)[1]
-        # poses beyond all numbers let anything agree
-        return np.nan_to_num(np.exp(np.minimum(volume + among / 2, 0.0)), nan=1.0)
-
-
-def _of_many(problem: _Problem, state: _State) -> _State:
+def _of_many(problem: DoubtedGraph, state: Accepted) -> Accepted:
     """Return the state with the loops that can be told from wrong ones."""
     state = _grown(problem, state, _EXPECTED_WRONG, stated=False)
     return _as_stated(problem, state)
 
 
-def _as_stated(problem: _Problem, state: _State) -> _State:
+def _as_stated(problem: DoubtedGraph, state: Accepted) -> Accepted:
     return _grown(problem, state._replace(variance=1.0), _EXPECTED_WRONG_AS_STATED, stated=True)
 
 
-def _of_few(problem: _Problem, state: _State) -> _State:
+def _of_few(problem: DoubtedGraph, state: Accepted) -> Accepted:
     """Return the state with all loops if they agree, else with those that can be told from wrong ones.
 
     A few right loops may not support each other enough for that. Then those are taken that the trusted edges
@@ -222,11 +142,11 @@ def _of_few(problem: _Problem, state: _State) -> _State:
     loops = np.flatnonzero(problem.doubted)
     if not len(loops):
         return state
-    judged, innovations = problem, _innovations(problem, state, loops).squared
+    judged, innovations = problem, innovations_of(problem, state, loops).squared
     scale = np.quantile(innovations, _SURELY_RIGHT / 2, method="lower") / chi2.median(problem.size)
     if len(loops) >= _ENOUGH_FOR_SCALE and 1.0 < scale < np.inf:
         judged = _loosened(problem, scale)
-        innovations = _innovations(judged, state, loops).squared
+        innovations = innovations_of(judged, state, loops).squared
     after, squared = _with(judged, state, loops)
     if _agree(judged, after, squared):
         return after
@@ -239,7 +159,7 @@ def _of_few(problem: _Problem, state: _State) -> _State:
     return allowed if counts[0] > _MANY_MORE * counts[1] else told
 
 
-def _loosened(problem: _Problem, scale: float) -> _Problem:
+def _loosened(problem: DoubtedGraph, scale: float) -> DoubtedGraph:
     """Return the problem with the information of its trusted edges divided by a scale."""
 
     def loose(graph: PoseGraph) -> PoseGraph:
@@ -248,24 +168,24 @@ def _loosened(problem: _Problem, scale: float) -> _Problem:
         return eqx.tree_at(lambda graph: graph.information, graph, graph.information * by[:, None, None])
 
     padded = problem.padded._replace(graph=loose(problem.padded.graph))
-    return _Problem(loose(problem.graph), problem.structure, padded, problem.doubted, problem.confidence)
+    return DoubtedGraph(loose(problem.graph), problem.structure, padded, problem.doubted, problem.confidence)
 
 
-def _with(problem: _Problem, state: _State, loops: NDArray[np.int64]) -> tuple[_State, _Array]:
+def _with(problem: DoubtedGraph, state: Accepted, loops: NDArray[np.int64]) -> tuple[Accepted, _Array]:
     """Return the state with some loops more, and r' Omega r of all edges."""
     kept = state.kept.copy()
     kept[loops] = True
-    descent = _solved(problem, kept, state.poses, _ON_THE_WAY, anew=True)
+    descent = solved_with(problem, kept, state.poses, _ON_THE_WAY, anew=True)
     squared = 2 * np.asarray(descent.point.edge_costs)[: len(kept)]
-    return _State(kept, descent.point.poses, state.variance, state.iterations + descent.iterations), squared
+    return Accepted(kept, descent.point.poses, state.variance, state.iterations + descent.iterations), squared
 
 
-def _freedom(problem: _Problem, state: _State) -> int:
+def _freedom(problem: DoubtedGraph, state: Accepted) -> int:
     """Return the degrees of freedom of the sum of all r' Omega r; at least 1."""
     return max(problem.size * int(np.sum(state.kept) - problem.structure.count), 1)
 
 
-def _agree(problem: _Problem, state: _State, squared: _Array) -> bool:
+def _agree(problem: DoubtedGraph, state: Accepted, squared: _Array) -> bool:
     """Return whether no accepted loop contradicts the others, and the loops did not bend the trusted edges.
 
     Right loops leave the trusted edges a sum of squares below that of all degrees of freedom.
@@ -275,7 +195,7 @@ def _agree(problem: _Problem, state: _State, squared: _Array) -> bool:
     return bool(worst <= problem.limit and squared[~problem.doubted].sum() <= most)
 
 
-def _without_the_worst(problem: _Problem, state: _State, loops: NDArray[np.int64]) -> _State | None:
+def _without_the_worst(problem: DoubtedGraph, state: Accepted, loops: NDArray[np.int64]) -> Accepted | None:
     """Return the state with some loops but the worst of them; None if too many would have to go.
 
     The worst one is that without which the cost falls most. Its fall is its squared innovation from all other
@@ -301,7 +221,7 @@ def _without_the_worst(problem: _Problem, state: _State, loops: NDArray[np.int64
     return None
 
 
-def _grown(problem: _Problem, state: _State, shares: tuple[float, ...], stated: bool) -> _State:
+def _grown(problem: DoubtedGraph, state: Accepted, shares: tuple[float, ...], stated: bool) -> Accepted:
     """Accept loops round by round, until no more can be told from wrong ones."""
     dropped = np.zeros(len(state.kept), np.int64)
     trials = 0 if stated else _TRIALS
@@ -309,7 +229,7 @@ def _grown(problem: _Problem, state: _State, shares: tuple[float, ...], stated: 
         waiting = np.flatnonzero(problem.doubted & ~state.kept & (dropped < _CHANCES))
         if not len(waiting):
             break
-        found = _innovations(problem, state, waiting)
+        found = innovations_of(problem, state, waiting)
         if number == 0 and not stated:
             state = state._replace(variance=_first_variance(found, problem))
         chance = found.chance(problem.limit, state.variance)
@@ -351,8 +271,8 @@ def _sure(chance: _Array, agrees: NDArray[np.bool_], shares: tuple[float, ...]) 
 
 
 def _supported(
-    problem: _Problem, state: _State, hopeful: NDArray[np.int64], sure: NDArray[np.int64]
-) -> tuple[_State, int]:
+    problem: DoubtedGraph, state: Accepted, hopeful: NDArray[np.int64], sure: NDArray[np.int64]
+) -> tuple[Accepted, int]:
     """Try loops until one lets others agree; return the state with it, and the number of loops tried.
 
     Loops at the end of a long drift cannot be told from wrong ones alone. A right one makes its neighbours
@@ -373,7 +293,7 @@ def _supported(
         others = others[~np.isin(others, sure)]
         if not len(others):
             continue
-        found = _innovations(problem, after, others)
+        found = innovations_of(problem, after, others)
         chance = found.chance(problem.limit, after.variance)
         judged = chance < chance_below
         support = np.sum(judged & (found.squared <= problem.limit * after.variance))
@@ -382,14 +302,14 @@ def _supported(
     return state, len(hopeful)
 
 
-def _accepting(problem: _Problem, state: _State, more: NDArray[np.int64], stated: bool) -> _State:
+def _accepting(problem: DoubtedGraph, state: Accepted, more: NDArray[np.int64], stated: bool) -> Accepted:
     """Accept loops, solve, and drop those that the solution contradicts, the worst first."""
     kept = state.kept.copy()
     kept[more] = True
     poses, variance, iterations = state.poses, state.variance, state.iterations
     anew = True
     while True:
-        descent = _solved(problem, kept, poses, _ON_THE_WAY, anew)
+        descent = solved_with(problem, kept, poses, _ON_THE_WAY, anew)
         poses, iterations, anew = descent.point.poses, iterations + descent.iterations, False
         squared = 2 * np.asarray(descent.point.edge_costs)[: len(kept)]
         loops = kept & problem.doubted
@@ -398,50 +318,11 @@ def _accepting(problem: _Problem, state: _State, more: NDArray[np.int64], stated
             variance = min(1.0, float((squared[kept].sum() + _STATED) / (freedom + _STATED)))
         largest = squared[loops].max(initial=0.0)
         if largest <= problem.limit * variance:
-            return _State(kept, poses, variance, iterations)
+            return Accepted(kept, poses, variance, iterations)
         kept = kept & ~(loops & (squared > max(problem.limit * variance, _WORST * largest)))
 
 
-def _solved(problem: _Problem, kept: NDArray[np.bool_], poses: Poses, limits: Limits, anew: bool) -> Descent:
-    """Descend with the kept edges only.
-
-    Args:
-        problem: the graph.
-        kept: (e,) edges that are used.
-        poses: poses to start from, at the padded size.
-        limits: conditions that end the descent.
-        anew: start from the poses that the kept edges suggest, where their cost is lower.
-    """
-    padded, structure = restricted(problem.graph, problem.padded, kept)
-    weights = kept.astype(np.float64)
-    at_padded_size = padded_weights(weights, padded)
-    if anew:
-        with suppress(NotPositiveDefiniteError):
-            guess = chordal_poses(problem.graph, structure, weights)
-            guess = padded_poses(guess, len(padded.graph.fixed))
-            costs = [float(point_at(each, at_padded_size, padded).cost) for each in (guess, poses)]
-            poses = guess if costs[0] < costs[1] else poses
-    return descend(padded, structure, poses, at_padded_size, limits)
-
-
-def _innovations(problem: _Problem, state: _State, loops: NDArray[np.int64]) -> _Innovations:
-    graph = problem.padded.graph
-    P = path_covariances(graph, problem.structure, problem.covariance, state.poses, state.kept, loops)
-    S = problem.covariance[loops] + P
-    r, false = (
-        np.clip(_residuals(state.poses, each), -_FARTHEST, _FARTHEST) for each in (graph, problem.false_loops)
-    )
-    r = r[loops]
-    squared = np.einsum("ei,ei->e", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])
-    return _Innovations(squared, S, false.T @ false / len(false))
-
-
-@jax.jit
-def _residuals(poses: Poses, graph: PoseGraph) -> jax.Array:
-    return residuals(picked(poses, graph.i), picked(poses, graph.j), graph)
-
-
-def _first_variance(found: _Innovations, problem: _Problem) -> float:
+def _first_variance(found: Innovations, problem: DoubtedGraph) -> float:
     """Return the variance of the noise, before any loop is accepted, over the stated one.
 
     Below the true variance right loops do not agree. Above it none but wrong ones are added, and these no
