@@ -157,14 +157,40 @@ def insert(
     inside = mask & _inside(block, pmap.cube, half_side)
     keys, slot = computed_once(claim_slots(pmap.block, block, inside))
     voxel = _voxel_in_block(cell, local)
-    homeless = jnp.sum(inside & (slot < 0), dtype=jnp.int32)
-    if pmap.off_centre is None:
-        offset = points - (local + 0.5) * EDGE * voxel_size
-        averaged, filled = _averaged(pmap, keys, jnp.where(slot >= 0, slot, capacity), voxel, offset)
-        return averaged, PointInsertion(filled, slot >= 0, homeless)
-    x, y, z = (points[:, axis] - (cell[:, axis] + 0.5) * voxel_size for axis in range(3))
-    off_centre = jnp.sqrt(x**2 + y**2 + z**2)
     target = jnp.where(slot >= 0, slot, capacity)
+    offset = [points[:, axis] - (local[:, axis] + 0.5) * EDGE * voxel_size for axis in range(3)]
+    if pmap.off_centre is None:
+        after, added = _averaged(pmap, keys, target, voxel, offset)
+        moved = slot >= 0
+    else:
+        x, y, z = (points[:, axis] - (cell[:, axis] + 0.5) * voxel_size for axis in range(3))
+        after, added = _nearest(pmap, keys, target, voxel, offset, jnp.sqrt(x**2 + y**2 + z**2), nearer_by)
+        moved = added
+    return after, PointInsertion(added, moved, jnp.sum(inside & (slot < 0), dtype=jnp.int32))
+
+
+def _nearest(
+    pmap: PointMap,
+    keys: Int32[Array, "c 3"],
+    target: Int32[Array, " m"],
+    voxel: Int32[Array, " m"],
+    offset: list[Float[Array, " m"]],
+    off_centre: Float[Array, " m"],
+    nearer_by: Float[Array, ""],
+) -> tuple[PointMap, Bool[Array, " m"]]:
+    """Return a map in which the point nearest to each voxel's centre is kept, and which of the points are.
+
+    Args:
+        pmap: the map before.
+        keys: its blocks after new ones were claimed.
+        target: slot of each point's block; the capacity where it has none.
+        voxel: number of each point's voxel in its block.
+        offset: x, y and z of each point from its block's centre, m.
+        off_centre: distance of each point from its voxel's centre, m.
+        nearer_by: least difference of the distances, m.
+    """
+    assert pmap.off_centre is not None
+    capacity = pmap.block.shape[0]
     held = pmap.off_centre.at[target, voxel].get(mode="fill", fill_value=-jnp.inf)
     nearer = computed_once(off_centre < held - nearer_by)
     target = jnp.where(nearer, target, capacity)
@@ -173,9 +199,8 @@ def insert(
     target = computed_once(jnp.where(added, target, capacity))
     point = pmap.point
     for axis in range(3):
-        offset = points[:, axis] - (local[:, axis] + 0.5) * EDGE * voxel_size
-        point = point.at[target, axis * VOXELS + voxel].set(offset, mode="drop")
-    return PointMap(keys, point, best, pmap.cube), PointInsertion(added, added, homeless)
+        point = point.at[target, axis * VOXELS + voxel].set(offset[axis], mode="drop")
+    return PointMap(keys, point, best, pmap.cube), added
 
 
 def _averaged(
@@ -183,7 +208,7 @@ def _averaged(
     keys: Int32[Array, "c 3"],
     target: Int32[Array, " m"],
     voxel: Int32[Array, " m"],
-    offset: Float[Array, "m 3"],
+    offset: list[Float[Array, " m"]],
 ) -> tuple[PointMap, Bool[Array, " m"]]:
     """Return a map of means with points in it, and which of these are in voxels that were empty.
 
@@ -192,7 +217,7 @@ def _averaged(
         keys: its blocks after new ones were claimed.
         target: slot of each point's block; the capacity where it has none.
         voxel: number of each point's voxel in its block.
-        offset: of each point from its block's centre, m.
+        offset: x, y and z of each point from its block's centre, m.
     """
     assert pmap.count is not None
     columns = [axis * VOXELS + voxel for axis in range(3)]
@@ -206,7 +231,7 @@ def _averaged(
     point = pmap.point
     for axis, column in enumerate(columns):
         point = point.at[target, column].set(held[axis], mode="drop")
-        point = point.at[target, column].add(share * (offset[:, axis] - held[axis]), mode="drop")
+        point = point.at[target, column].add(share * (offset[axis] - held[axis]), mode="drop")
     return PointMap(keys, point, None, pmap.cube, count), empty
 
 
