@@ -14,19 +14,17 @@ from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import read_text
 from lio_jax.core.timestamps import FARTHEST_NS, seconds_to_ns
 from lio_jax.data.config import DataConfig
-from lio_jax.data.reconstruct import KITTI_START_AZIMUTH, azimuth_time
 from lio_jax.data.sequence import LidarScan, Reader, SequenceBase, SequenceInfo, scans_from
 from lio_jax.data.time_order import Stamped, ascending, in_time_order
 from lio_jax.data.trajectory import Trajectory, are_rigid, read_kitti_poses
 from lio_jax.data.velodyne_file import (
     check_sizes,
     elevation_note,
-    hdl64_ring,
+    hdl64_scan,
     listed,
     listed_runs,
     missing_runs,
     numbered_files,
-    raise_elevation,
     read_returns,
 )
 
@@ -91,16 +89,9 @@ class KittiSequence(SequenceBase):
         return Trajectory(stamps, np.linalg.inv(lidar[0]) @ lidar)
 
     def _scan(self, stamp_ns: int, rows: NDArray[np.float32]) -> LidarScan:
-        points = np.ascontiguousarray(rows[:, :3])
         duration = 0.0 if self._compensated else self._config.scan_period
-        return LidarScan(
-            stamp_ns=stamp_ns - round(duration * 0.5e9),
-            points=raise_elevation(points, self._config.vertical_correction_deg),
-            time=azimuth_time(points, duration, start_azimuth=KITTI_START_AZIMUTH),
-            ring=hdl64_ring(points),
-            intensity=np.ascontiguousarray(rows[:, 3]),
-            duration=duration,
-        )
+        start_ns = stamp_ns - round(duration * 0.5e9)
+        return hdl64_scan(rows, start_ns, duration, self._config.vertical_correction_deg)
 
     def _read_stamps(self, files: dict[int, Path]) -> dict[int, int]:
         """Return the stamps by the scan's number, ns."""

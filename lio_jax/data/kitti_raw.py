@@ -14,19 +14,17 @@ from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import read_text
 from lio_jax.data.config import DataConfig
 from lio_jax.data.enu import geodetic_to_enu, mercator_positions
-from lio_jax.data.reconstruct import KITTI_START_AZIMUTH, azimuth_time
 from lio_jax.data.sequence import GpsData, ImuData, LidarScan, Reader, SequenceBase, SequenceInfo, scans_from
 from lio_jax.data.time_order import Stamped, ascending, in_time_order
 from lio_jax.data.trajectory import Trajectory, are_rigid
 from lio_jax.data.velodyne_file import (
     check_sizes,
     elevation_note,
-    hdl64_ring,
+    hdl64_scan,
     listed,
     listed_runs,
     missing_runs,
     numbered_files,
-    raise_elevation,
     read_returns,
 )
 
@@ -207,17 +205,9 @@ class KittiRawSequence(SequenceBase):
         """Yield scans, stamped at their start; all points have time 0 if config declares them compensated."""
         for sweep in self._sweeps[scans_from(start, count)]:
             rows = read_returns(sweep.path, self._log.add)
-            if rows is None:
-                continue
-            points = np.ascontiguousarray(rows[:, :3])
-            yield LidarScan(
-                stamp_ns=sweep.stamp_ns,
-                points=raise_elevation(points, self._config.vertical_correction_deg),
-                time=azimuth_time(points, sweep.duration, start_azimuth=KITTI_START_AZIMUTH),
-                ring=hdl64_ring(points),
-                intensity=np.ascontiguousarray(rows[:, 3]),
-                duration=sweep.duration,
-            )
+            if rows is not None:
+                raised = self._config.vertical_correction_deg
+                yield hdl64_scan(rows, sweep.stamp_ns, sweep.duration, raised)
 
     def imu(self) -> ImuData | None:
         """Return accelerations and rates of the INS, body frame (10 Hz in sync drives, 100 Hz in extract)."""

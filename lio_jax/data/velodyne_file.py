@@ -9,8 +9,13 @@ from numpy.typing import NDArray
 
 from lio_jax.data.cloud_fields import valid_returns
 from lio_jax.data.config import DataConfig
-from lio_jax.data.reconstruct import ring_from_azimuth_wraps, ring_from_elevation
-from lio_jax.data.sequence import check_still_there
+from lio_jax.data.reconstruct import (
+    KITTI_START_AZIMUTH,
+    azimuth_time,
+    ring_from_azimuth_wraps,
+    ring_from_elevation,
+)
+from lio_jax.data.sequence import LidarScan, check_still_there
 
 BYTES_PER_POINT = 16
 """Size of one row x, y, z, intensity in float32."""
@@ -83,7 +88,29 @@ def check_sizes(paths: Iterable[Path], warn: Callable[[str], None]) -> None:
             _check_size(path, path.stat().st_size, warn)
 
 
-def hdl64_ring(points: NDArray[np.float32]) -> NDArray[np.int32]:
+def hdl64_scan(
+    rows: NDArray[np.float32], stamp_ns: int, duration: float, vertical_correction_deg: float
+) -> LidarScan:
+    """Return the scan of KITTI's HDL-64E, which turns clockwise from straight behind.
+
+    Args:
+        rows: (n, 4) x, y, z in m and intensity, as :func:`read_returns` gives them.
+        stamp_ns: time of the scan's start, ns.
+        duration: time of the sweep, s; 0 where the points are motion compensated.
+        vertical_correction_deg: see :func:`raise_elevation`.
+    """
+    points = np.ascontiguousarray(rows[:, :3])
+    return LidarScan(
+        stamp_ns=stamp_ns,
+        points=raise_elevation(points, vertical_correction_deg),
+        time=azimuth_time(points, duration, start_azimuth=KITTI_START_AZIMUTH),
+        ring=_hdl64_ring(points),
+        intensity=np.ascontiguousarray(rows[:, 3]),
+        duration=duration,
+    )
+
+
+def _hdl64_ring(points: NDArray[np.float32]) -> NDArray[np.int32]:
     """Return the beams by storage order, or by elevation where the order is not that of KITTI."""
     ring = ring_from_azimuth_wraps(points)
     if ring.size and ring[-1] >= _HDL64_BEAMS:
