@@ -15,23 +15,17 @@ from the journal instead of computing it: scans are decoded and padded again, an
 the back end and a user's own sinks are built again by the code that built them first. Hence nothing of them
 has to be stored, and nothing of them can differ. From the checkpoint on, steps are computed again. On the
 same machine with the same versions, the results are equal to the bit.
-
-A record is a header (length and CRC-32 of what follows), the length of a JSON text, that text, and the bytes
-of the arrays that it describes.
 """
 
-import json
 import os
 import queue
-import struct
 import threading
 import time
-import zlib
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, Protocol, TypeVar
+from typing import Any, BinaryIO, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +36,7 @@ from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import atomic_path, remove_leftovers
 from lio_jax.data.sequence import Sequence
 from lio_jax.data.trajectory import Trajectory, pose_matrices, tum_lines
+from lio_jax.run.record import Record, read_record
 from lio_jax.run.unfinished import (
     CONFIG,
     JOURNAL,
@@ -61,49 +56,6 @@ POSES_AT_ONCE = 10
 _WAITING = 32
 """Number of results that may wait for the disk; beyond that the run waits."""
 _RESULTS, _CHECKPOINT = "results", "checkpoint"
-_HEADER = struct.Struct("<QI")
-_TEXT = struct.Struct("<I")
-
-
-class Record(NamedTuple):
-    """Numbers by name, and arrays."""
-
-    values: dict[str, Any]
-    arrays: list[NDArray[Any]]
-
-    def as_bytes(self) -> bytes:
-        """Return the record as it stands in a file."""
-        arrays = [np.asarray(array, order="C") for array in self.arrays]
-        shapes = [[array.dtype.name, array.shape] for array in arrays]
-        text = json.dumps({"values": self.values, "arrays": shapes}).encode()
-        # flat views: the bytes are copied once
-        flat = [array.reshape(-1).view(np.uint8).data for array in arrays]
-        payload = b"".join([_TEXT.pack(len(text)), text, *flat])
-        return _HEADER.pack(len(payload), zlib.crc32(payload)) + payload
-
-
-def read_record(file: BinaryIO) -> Record:
-    """Return the record at a file's position.
-
-    Raises:
-        ValueError: it is cut short or damaged.
-    """
-    header = file.read(_HEADER.size)
-    if len(header) < _HEADER.size:
-        raise ValueError("it ends within a record")
-    length, checksum = _HEADER.unpack(header)
-    rest = os.fstat(file.fileno()).st_size - file.tell()
-    payload = file.read(min(length, rest))
-    if len(payload) != length or zlib.crc32(payload) != checksum:
-        raise ValueError("a record is damaged")
-    (end,) = _TEXT.unpack_from(payload)
-    described = json.loads(payload[_TEXT.size : _TEXT.size + end])
-    arrays, at = [], _TEXT.size + end
-    for name, shape in described["arrays"]:
-        dtype, size = jnp.dtype(name), int(np.prod(shape, dtype=np.int64))
-        arrays.append(np.frombuffer(payload, dtype, size, at).reshape(shape))
-        at += size * dtype.itemsize
-    return Record(described["values"], arrays)
 
 
 class Structured(Protocol):

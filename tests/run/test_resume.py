@@ -19,7 +19,8 @@ from lio_jax.data import write_native
 from lio_jax.data.trajectory import read_tum
 from lio_jax.run import journal as journal_module
 from lio_jax.run.folder import run_folder
-from lio_jax.run.journal import Record, opened_journal, read_record
+from lio_jax.run.journal import opened_journal
+from lio_jax.run.record import Record, read_record
 from lio_jax.run.run import run_sequence, settings_for
 from lio_jax.run.sinks import Sink
 from lio_jax.run.unfinished import JOURNAL, MARK, read_unfinished
