@@ -151,7 +151,8 @@ def mean_and_error(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def ends_of(recipe: Any, free: Any, objective: Any, pairs: np.ndarray, recording: Any) -> Ends:
     """Return what runs at pairs of parameter vectors, (n, 2, p), lead to; all run side by side."""
     from lio_jax.recipes.transforms import batched
-    from lio_jax.run.track import Compiled, run_steps
+    from lio_jax.run.compiled import Compiled
+    from lio_jax.run.track import run_steps
 
     rows = jnp.asarray(pairs.reshape(-1, pairs.shape[-1]))
     params = jax.vmap(free)(rows)

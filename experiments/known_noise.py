@@ -118,7 +118,8 @@ class Workshop:
         """Run with the parameters of ``x``, or with the shipped ones for None, and compare with the truth."""
         from lio_jax.core.error_state import local
         from lio_jax.evaluation.trajectory_error import align, nees, position_errors
-        from lio_jax.run.track import CompiledStep, run_steps
+        from lio_jax.run.compiled import CompiledStep
+        from lio_jax.run.track import run_steps
 
         recording, sequence = self.recording(world, seed)
         arrays, motion = sequence.truth_arrays(), sequence.truth()

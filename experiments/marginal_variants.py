@@ -106,7 +106,8 @@ def fitted(variant: Variant, recordings: list[Terms], factor: float) -> tuple[np
 
 def gathered(shop: Workshop, world: str, seed: int) -> tuple[Sweep, jaxlie.SE3, jaxlie.SE3]:
     """Run lio_sam and return the measurements: sweeps, matched poses, and the true poses."""
-    from lio_jax.run.track import CompiledStep, run_steps
+    from lio_jax.run.compiled import CompiledStep
+    from lio_jax.run.track import run_steps
 
     recording, _ = shop.recording(world, seed)
     step = CompiledStep(shop.settings)

@@ -56,6 +56,7 @@ from .recipes.recipe import Recipe as Recipe
 from .recipes.recipe import State as State
 from .registration.voxel_planes import associate as associate
 from .registration.voxel_planes import point_noise as point_noise
+from .run.compiled import CompiledStep as CompiledStep
 from .run.known_map import KnownMap as KnownMap
 from .run.localise import localise as localise
 from .run.pushed import PushedOdometry as PushedOdometry
@@ -65,7 +66,6 @@ from .run.run import run_sequence as run_sequence
 from .run.run import settings_for as settings_for
 from .run.sinks import RunResult as RunResult
 from .run.sinks import Sink as Sink
-from .run.track import CompiledStep as CompiledStep
 from .run.track import ScanResult as ScanResult
 from .run.track import run_steps as run_steps
 from .run.track import scan_inputs as scan_inputs

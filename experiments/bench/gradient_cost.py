@@ -60,8 +60,9 @@ def measured(options: argparse.Namespace, scans: int, keep: bool) -> dict[str, f
     meanwhile, in constant memory.
     """
     from lio_jax import ImuModel, SimulatedSequence
+    from lio_jax.run.compiled import CompiledStep
     from lio_jax.run.run import peak_rss_mb, settings_for
-    from lio_jax.run.track import CompiledStep, run_steps
+    from lio_jax.run.track import run_steps
     from lio_jax.settings.settings import recipe_of, recipe_settings
     from lio_jax.tuning.objectives import objective_named
     from lio_jax.tuning.parameters import free_parameters

@@ -11,6 +11,7 @@ from systems import Pose
 
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.lidar.params import RingConfig
+from lio_jax.run.compiled import CompiledStep
 from lio_jax.run.fitted_settings import (
     with_inertial_noise,
     with_range_noise,
@@ -18,7 +19,7 @@ from lio_jax.run.fitted_settings import (
 )
 from lio_jax.run.run import imu_feed
 from lio_jax.run.scan_inputs import bucket_for
-from lio_jax.run.track import CompiledStep, pose_matrix, run_steps, scan_inputs
+from lio_jax.run.track import pose_matrix, run_steps, scan_inputs
 from lio_jax.settings.settings import Settings, recipe_settings, with_extrinsics, with_overrides
 
 _OPENING = 3

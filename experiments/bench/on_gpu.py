@@ -24,9 +24,10 @@ from lio_jax.commands.runtime import prepare_jax
 from lio_jax.data.detect import open_sequence
 from lio_jax.data.sequence import Sequence
 from lio_jax.recipes.transforms import RecipeLike, batched
+from lio_jax.run.compiled import Compiled
 from lio_jax.run.run import imu_feed, settings_for
 from lio_jax.run.scan_inputs import ScanInput
-from lio_jax.run.track import Compiled, run_steps, scan_inputs
+from lio_jax.run.track import run_steps, scan_inputs
 from lio_jax.settings.settings import Settings, recipe_of, recipe_settings
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 
 from lio_jax.data.sequence import Sequence
 from lio_jax.recipes.transforms import batched
+from lio_jax.run.compiled import Compiled
 from lio_jax.run.logs import Failures, Overflow, StageTimes, TrajectoryLog
 from lio_jax.run.run import check_start, imu_feed, nothing_read, prediction
 from lio_jax.run.sinks import RunResult, Sink, finish_all
-from lio_jax.run.track import Compiled, ResultBuilder, run_steps, scan_inputs
+from lio_jax.run.track import ResultBuilder, run_steps, scan_inputs
 from lio_jax.run.verdict import Verdict
 from lio_jax.settings.settings import Settings, recipe_of
 

@@ -17,9 +17,10 @@ from lio_jax.loops.overlap import Candidate
 from lio_jax.loops.place_in_map import places_along, places_near
 from lio_jax.pose_graph.graph import heading_of
 from lio_jax.recipes.recipe import LocalisingRecipe
+from lio_jax.run.compiled import CompiledStep
 from lio_jax.run.known_map import KnownMap, MapPager, driven_path
 from lio_jax.run.scan_inputs import InputsInTurn, ScanInput, feed_of
-from lio_jax.run.track import CompiledStep, pose_matrix
+from lio_jax.run.track import pose_matrix
 from lio_jax.settings.settings import Settings, recipe_of
 
 _SCANS_TRIED = 50

@@ -18,10 +18,11 @@ from lio_jax.data.part_recognition import LOOKED_AT_NS, narrow, recognise_joinin
 from lio_jax.data.point_time import TICK_NS, PointTiming
 from lio_jax.data.scan_reading import ScanReading
 from lio_jax.data.sequence import ImuData, LidarScan, SequenceBase, SequenceInfo, scans_from
+from lio_jax.run.compiled import CompiledStep
 from lio_jax.run.localise import check_no_known_map
 from lio_jax.run.run import settings_for
 from lio_jax.run.scan_inputs import ImuFeed, InputsInTurn, feed_of
-from lio_jax.run.track import CompiledStep, ResultBuilder, ScanResult, StepsInTurn, on_host
+from lio_jax.run.track import ResultBuilder, ScanResult, StepsInTurn, on_host
 from lio_jax.settings.settings import Settings, uses_imu
 
 _PATIENCE_NS = 500_000_000

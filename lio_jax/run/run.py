@@ -14,6 +14,7 @@ from lio_jax.data.detect import without_effect
 from lio_jax.data.imu_checks import cleaned
 from lio_jax.data.sequence import LidarScan, Sequence
 from lio_jax.run.clock_jumps import without_clock_jumps
+from lio_jax.run.compiled import CompiledStep
 from lio_jax.run.feedback import Feedback
 from lio_jax.run.fitted_settings import (
     fitted_to_surroundings,
@@ -34,7 +35,7 @@ from lio_jax.run.scan_inputs import ImuFeed, feed_of
 from lio_jax.run.set_up_check import SetUpCheck
 from lio_jax.run.sinks import RunResult, Sink, finish_all
 from lio_jax.run.state_files import ImuRateFile, StateFiles
-from lio_jax.run.track import CompiledStep, ScanResult, track
+from lio_jax.run.track import ScanResult, track
 from lio_jax.run.verdict import Verdict
 from lio_jax.settings.settings import Settings, uses_imu, with_extrinsics
 

@@ -22,9 +22,10 @@ from lio_jax.loops.back_end import BackEnd
 from lio_jax.loops.closing import LoopCloser
 from lio_jax.recipes import recipe_named
 from lio_jax.recipes.transforms import Dual, push_forward
+from lio_jax.run.compiled import CompiledStep
 from lio_jax.run.global_correction import gps_gate, light
 from lio_jax.run.keyframes import KeyframePicker
-from lio_jax.run.track import CompiledStep, ResultBuilder, run_steps
+from lio_jax.run.track import ResultBuilder, run_steps
 from lio_jax.settings.settings import Settings
 from lio_jax.settings.shared import GlobalParams
 from lio_jax.tuning.evaluated import Evaluated

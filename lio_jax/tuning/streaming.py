@@ -17,7 +17,8 @@ from lio_jax.core.types import ITERATION_LIMIT, NOT_FINITE, Scan
 from lio_jax.core.xla import programs
 from lio_jax.recipes.params import RecipeParams as Params
 from lio_jax.recipes.transforms import Dual, RecipeLike, batched, push_forward, with_tangents
-from lio_jax.run.track import Compiled, run_steps
+from lio_jax.run.compiled import Compiled
+from lio_jax.run.track import run_steps
 from lio_jax.tuning.objectives import Objective, Observed, Observing, TruePose
 from lio_jax.tuning.parameters import ParameterVector
 from lio_jax.tuning.recording import Recording

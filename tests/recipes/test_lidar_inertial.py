@@ -13,9 +13,10 @@ from scipy.spatial.transform import Rotation
 from lio_jax.core.error_state import EXTRINSIC_ROTATION, EXTRINSIC_TRANSLATION, TIME_OFFSET
 from lio_jax.evaluation.trajectory_error import nees
 from lio_jax.recipes.default import Default
+from lio_jax.run.compiled import CompiledStep
 from lio_jax.run.run import settings_for
 from lio_jax.run.scan_inputs import OFFSET_MARGIN_S, ImuFeed
-from lio_jax.run.track import CompiledStep, ScanResult, pose_matrix, track
+from lio_jax.run.track import ScanResult, pose_matrix, track
 from lio_jax.settings.settings import Settings, with_extrinsics, with_overrides
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence

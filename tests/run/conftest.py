@@ -2,7 +2,8 @@
 
 import pytest
 
-from lio_jax.run.track import CompiledStep, ScanResult, track
+from lio_jax.run.compiled import CompiledStep
+from lio_jax.run.track import ScanResult, track
 from lio_jax.settings.settings import Settings, with_extrinsics, with_overrides
 from tests.run import inertial_drive, small_drive
 

@@ -10,8 +10,9 @@ import pytest
 
 from lio_jax.data.sequence import ImuData, LidarScan
 from lio_jax.data.trajectory import Trajectory
+from lio_jax.run.compiled import CompiledStep
 from lio_jax.run.run import imu_feed
-from lio_jax.run.track import CompiledStep, ScanResult, track
+from lio_jax.run.track import ScanResult, track
 from lio_jax.settings.settings import Settings
 from tests.run.inertial_drive import (
     END,

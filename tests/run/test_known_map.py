@@ -16,13 +16,13 @@ from lio_jax.core.geometry import rotation_matrix
 from lio_jax.mapping.voxel_map import FREE
 from lio_jax.recipes.recipe import LocalisingRecipe
 from lio_jax.run import known_map
+from lio_jax.run.compiled import CompiledStep
 from lio_jax.run.known_map import KnownMap, MapPager
 from lio_jax.run.localise import localise, step_of
 from lio_jax.run.map_file import write_cloud
 from lio_jax.run.pushed import PushedOdometry
 from lio_jax.run.run import run_sequence, settings_for
 from lio_jax.run.scan_inputs import feed_of
-from lio_jax.run.track import CompiledStep
 from lio_jax.settings.settings import recipe_of, recipe_settings, with_extrinsics, with_overrides
 from lio_jax.tuning.gradient import gradient
 from tests.run import inertial_drive

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from lio_jax.core.xla import forget_programs
+from lio_jax.run.compiled import CompiledStep
 from lio_jax.run.pushed import PushedOdometry, rehearse
 from lio_jax.run.run import imu_feed, settings_for
-from lio_jax.run.track import CompiledStep, track
+from lio_jax.run.track import track
 from lio_jax.settings.settings import Settings
 from tests.run.inertial_drive import RATE, START, InertialReplay, drive, imu, scans
 from tests.run.small_drive import without_points

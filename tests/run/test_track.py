@@ -8,7 +8,8 @@ import jax
 import numpy as np
 import pytest
 
-from lio_jax.run.track import CompiledStep, track
+from lio_jax.run.compiled import CompiledStep
+from lio_jax.run.track import track
 from lio_jax.settings.settings import Settings, with_overrides
 from tests.run.small_drive import COUNT, PERIOD_NS, moving, shifted, standing, truth, without_points
 

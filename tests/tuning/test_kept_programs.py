@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from lio_jax.core.xla import forget_programs, programs
+from lio_jax.run.compiled import CompiledStep
 from lio_jax.run.run import imu_feed
-from lio_jax.run.track import CompiledStep, track
+from lio_jax.run.track import track
 from lio_jax.settings.settings import Settings, with_overrides
 from lio_jax.sim.imu import ImuModel
 from lio_jax.sim.sequence import SimulatedSequence

@@ -11,7 +11,8 @@ import pytest
 from lio_jax.core.leaf import settings_of
 from lio_jax.recipes import RECIPES
 from lio_jax.recipes.recipe import Recipe
-from lio_jax.run.track import Compiled, run_steps
+from lio_jax.run.compiled import Compiled
+from lio_jax.run.track import run_steps
 from lio_jax.settings.settings import recipe_of
 from lio_jax.tuning.objectives import MarginalLikelihood, Observed
 from lio_jax.tuning.parameters import free_parameters

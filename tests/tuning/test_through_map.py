@@ -13,7 +13,8 @@ import pytest
 from lio_jax.mapping import feature_map, point_map, voxel_map
 from lio_jax.recipes import RECIPES, fast_lio2, lidar_inertial, lidar_odometry, lio_sam, loam
 from lio_jax.registration import scan_to_scan
-from lio_jax.run.track import Compiled, run_steps
+from lio_jax.run.compiled import Compiled
+from lio_jax.run.track import run_steps
 from lio_jax.settings.settings import recipe_of
 from lio_jax.tuning.gradient import wants_map
 from lio_jax.tuning.objectives import Observed, objective_named
