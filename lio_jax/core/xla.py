@@ -110,8 +110,9 @@ _CPU_OPTIONS: dict[str, bool | str] = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_disable_hlo_passes": "cpu-parallel-task-assigner",
 }
-"""Options of the CPU backend. XLA's newer kernel emitters compile twice as long, for a step no faster. And XLA
-would divide among threads each kernel that reads more than some 20 kB or gathers from a large table. A step
+"""Options of the CPU backend. XLA's newer kernel emitters compile twice as long, for a step no faster.
+
+XLA would divide among threads each kernel that reads more than some 20 kB or gathers from a large table. A step
 has hundreds of such kernels, each of some microseconds, and waking the threads takes longer than the work."""
 
 

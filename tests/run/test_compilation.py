@@ -21,7 +21,7 @@ def test_a_program_is_compiled_whether_or_not_the_options_are_known(options, mon
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="options of the CPU backend")
 def test_a_kernel_is_not_divided_among_threads():
     table, rows = jnp.zeros((65536, 81)), jnp.arange(512)
-    divided = "outer_dimension_partitions\":[\""
+    divided = 'outer_dimension_partitions":["'
     gathered = jax.jit(lambda table, rows: table[rows])
     if len(os.sched_getaffinity(0)) > 1:  # else XLA divides nothing
         assert divided in gathered.lower(table, rows).compile().as_text()
