@@ -113,7 +113,7 @@ _CPU_OPTIONS: dict[str, bool | str] = {
 """Options of the CPU backend. XLA's newer kernel emitters compile twice as long, for a step no faster.
 
 XLA would divide among threads each kernel that reads more than some 20 kB or gathers from a large table. A
-step has hundreds of such kernels, each of some microseconds, and waking the threads takes longer than that."""
+step has hundreds of such kernels, each of some microseconds, and waking the threads takes longer."""
 
 
 def compiled(function: Any, *arguments: Any) -> jax.stages.Compiled:
