@@ -106,8 +106,14 @@ def added_in_place(
     return after.at[0].add(0 * same[0])
 
 
-_CPU_OPTIONS: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False}
-"""Options of the CPU backend: XLA's newer kernel emitters compile twice as long, for a step no faster."""
+_CPU_OPTIONS: dict[str, bool | str] = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_disable_hlo_passes": "cpu-parallel-task-assigner",
+}
+"""Options of the CPU backend. XLA's newer kernel emitters compile twice as long, for a step no faster.
+
+XLA would divide among threads each kernel that reads more than some 20 kB or gathers from a large table. A
+step has hundreds of such kernels, each of some microseconds, and waking the threads takes longer."""
 
 
 def compiled(function: Any, *arguments: Any) -> jax.stages.Compiled:

@@ -21,8 +21,12 @@ class Frame(eqx.Module):
     ) -> tuple[Float[Array, "k 3"], Float[Array, "k 3"]]:
         """Return points of the lidar frame in world axes, from the sensor and from the origin, m."""
         R, shift = self.placing(T_world_lidar, points.dtype)
-        arm = points @ R.T
-        return arm, arm + shift
+        # column by column: on a CPU XLA computes the product of many points in a kernel of its own, which
+        # takes longer than these sums in the kernel that uses them
+        x, y, z = (points[:, axis] for axis in range(3))
+        arm = [R[axis, 0] * x + R[axis, 1] * y + R[axis, 2] * z for axis in range(3)]
+        placed = [column + shift[axis] for axis, column in enumerate(arm)]
+        return jnp.stack(arm, -1), jnp.stack(placed, -1)
 
     def placing(
         self, T_world_lidar: jaxlie.SE3, dtype: jnp.dtype

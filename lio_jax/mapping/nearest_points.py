@@ -84,7 +84,8 @@ def nearest_points(
     scaled = points / edge
     fraction = scaled - jnp.floor(scaled)
     # along each axis the eight blocks cover the query's own block and its neighbour on the nearer side
-    sure = edge * jnp.min(jnp.maximum(fraction, 1 - fraction), axis=-1)
+    covered = jnp.maximum(fraction, 1 - fraction)
+    sure = edge * jnp.minimum(jnp.minimum(covered[:, 0], covered[:, 1]), covered[:, 2])
     unsure = mask & (jnp.minimum(found.squared_distance[-1], radius**2) > sure**2)
     rank = running_count(unsure) - 1
     waiting = jnp.full(count, count, jnp.int32).at[jnp.where(unsure, rank, count)].set(order, mode="drop")

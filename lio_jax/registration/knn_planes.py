@@ -1,5 +1,6 @@
 """Match a scan with planes through its nearest neighbours in a map of points (FAST-LIO2)."""
 
+import functools
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -187,7 +188,7 @@ def fit_planes(x: _Coordinates, y: _Coordinates, z: _Coordinates) -> PlaneFit:
     (cx, cy, cz), (qx, qy, qz), moments = spread(x, y, z)
     variances, normal = computed_once(eigenvalues_and_normal3(moments[:, :3], moments[:, 3:]))
     nx, ny, nz = normal[:, 0], normal[:, 1], normal[:, 2]
-    farthest = jnp.max(jnp.abs(nx * qx + ny * qy + nz * qz), 0)
+    farthest = functools.reduce(jnp.maximum, jnp.abs(nx * qx + ny * qy + nz * qz))
     return PlaneFit(normal, -(nx * cx + ny * cy + nz * cz), farthest, variances[:, 1])
 
 
@@ -225,10 +226,15 @@ def spread(
         The moments divided by the number of points, xx, yy, zz, xy, xz and yz, m^2.
     """
     n = x.shape[0]
-    cx, cy, cz = computed_once((jnp.sum(x, 0) / n, jnp.sum(y, 0) / n, jnp.sum(z, 0) / n))
+
+    def mean(values: _Coordinates) -> Array:
+        # row by row: XLA would sum a few long rows in a kernel of its own, which takes longer
+        return sum(values[1:], values[0]) / n
+
+    cx, cy, cz = computed_once((mean(x), mean(y), mean(z)))
     qx, qy, qz = x - cx, y - cy, z - cz
     pairs = ((qx, qx), (qy, qy), (qz, qz), (qx, qy), (qx, qz), (qy, qz))
-    moments = computed_once(jnp.stack([jnp.sum(u * v, 0) / n for u, v in pairs], -1))
+    moments = computed_once(jnp.stack([mean(u * v) for u, v in pairs], -1))
     return (cx, cy, cz), (qx, qy, qz), moments
 
 
