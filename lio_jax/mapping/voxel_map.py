@@ -27,6 +27,11 @@ FREE = -(2**31)
 SUBDIVISION = 4
 """Number of cells along a voxel's edge. Each cell takes one point, so 4 x 4 x 4 = 64 bits show which are
 filled."""
+_CLEAR = 2.0
+"""Standard deviations of its tilt by which a plane has to pass beside the sensor that saw it."""
+_LEAST_SPREAD = 3e-3
+"""Least standard deviation of points about their plane, m: few may lie on one by chance."""
+_PLANE_DOF = 3
 _BATCH = 4096
 """Number of points inserted at a time. Most scans have fewer new points, and need one batch."""
 _OFFSETS = np.concatenate([np.zeros((1, 3), np.int32), np.eye(3, dtype=np.int32)])
@@ -44,7 +49,8 @@ class VoxelMap(eqx.Module):
     cells: UInt32[Array, "c 2"]
     """Bit set of the cells that hold a point."""
     centroid: Float[Array, "c 4"]
-    """Mean of the points relative to the voxel's centre, m, and their number. A look-up compares these."""
+    """Mean of the points relative to the voxel's centre, m, and their number, negative where the
+    sensor lay in their plane. A look-up compares these."""
     plane: Float[Array, "c 5"]
     """Unit normal, and the two smaller variances, ascending, m^2. A match uses these."""
 
@@ -74,6 +80,8 @@ class VoxelPlanes(eqx.Module):
     """The two smaller variances, ascending, m^2."""
     count: Float[Array, " k"]
     """Number of points of the distribution."""
+    surface: Bool[Array, " k"]
+    """False where the plane contains the sensor that saw it; see :func:`insert`."""
     slot: Int32[Array, " k"]
     """Where the table holds the points; 0 where it does not."""
     valid: Bool[Array, " k"]
@@ -135,8 +143,8 @@ def query_nearest(
     local = own.astype(jnp.int32) + _OFFSETS[:, None] * side
     slots = computed_once(find_slots(vmap, local + anchor))
     held = jnp.maximum(slots, 0)
-    away = points - _mean(vmap, held, local, voxel_size)
-    usable = (slots >= 0) & (_take(vmap.centroid, (held, 3)) >= min_points)
+    away = points - _centre(local, voxel_size) - _take(vmap.centroid, held)[..., :3]
+    usable = (slots >= 0) & (jnp.abs(_take(vmap.centroid, (held, 3))) >= min_points)
     squared = jnp.where(usable, away[..., 0] ** 2 + away[..., 1] ** 2 + away[..., 2] ** 2, jnp.inf)
     distance, nearest = jnp.full_like(squared[0], jnp.inf), jnp.full_like(slots[0], -1)
     for other, slot in zip(squared, slots, strict=True):
@@ -144,12 +152,14 @@ def query_nearest(
         distance = jnp.minimum(other, distance)
     nearest = computed_once(nearest)
     found = jnp.maximum(nearest, 0)
-    plane = _take(vmap.plane, found)
+    plane, centroid = _take(vmap.plane, found), computed_once(_take(vmap.centroid, found))
+    count = centroid[:, 3]
     return VoxelPlanes(
-        mean=_mean(vmap, found, _take(vmap.voxel, found) - anchor, voxel_size),
+        mean=_centre(_take(vmap.voxel, found) - anchor, voxel_size) + centroid[:, :3],
         normal=plane[:, :3],
         variances=plane[:, 3:],
-        count=_take(vmap.centroid, (found, 3)),
+        count=jnp.abs(count),
+        surface=count > 0,
         slot=found,
         valid=nearest >= 0,
     )
@@ -162,12 +172,17 @@ def insert(
     anchor: Int32[Array, "3"],
     voxel_size: Float[Array, ""],
     reach: Float[Array, ""],
+    sensor: Float[Array, "3"] | None = None,
 ) -> tuple[VoxelMap, Insertion]:
     """Add points to the distributions of their voxels.
 
     A point is added only if its cell is empty, so a distribution is uniform although the sensor's lines are
     not. A new voxel claims a slot that is free, or that holds a voxel farther than ``reach`` from the anchor.
     So the map forgets voxels that are far away.
+
+    The points of one scan line that runs around the corner of a house spread over a plane: that of the beams,
+    which is no surface. It contains the sensor. A voxel whose plane does so within the uncertainty of its
+    tilt is no surface until points seen from elsewhere have changed the plane.
 
     Args:
         vmap: the map; donate it if it is not needed afterwards.
@@ -176,9 +191,10 @@ def insert(
         anchor: voxel whose lower corner is the origin of ``points``.
         voxel_size: edge length, m.
         reach: distance from the anchor beyond which voxels may be overwritten, m.
+        sensor: where the points were seen from, m, in the anchored frame; None: not known.
     """
     count = points.shape[0]
-    vmap, points = jax.lax.stop_gradient((vmap, points.astype(vmap.moments.dtype)))
+    vmap, points, sensor = jax.lax.stop_gradient((vmap, points.astype(vmap.moments.dtype), sensor))
     grid = _Grid(anchor, voxel_size.astype(points.dtype), reach)
     voxel, cell, _ = grid.places(points)
     slot = computed_once(find_slots(vmap, voxel))
@@ -194,7 +210,7 @@ def insert(
         vmap, added, dropped = carry
         index = jax.lax.dynamic_slice(waiting, (number * batch,), (batch,))
         row = jnp.minimum(index, count - 1)
-        vmap, fills, homeless = _insert_new(vmap, _take(points, row), index < count, grid)
+        vmap, fills, homeless = _insert_new(vmap, _take(points, row), index < count, grid, sensor)
         added = added.at[jnp.where(fills, index, count)].set(True, mode="drop")
         return vmap, added, dropped + jnp.sum(homeless, dtype=jnp.int32)
 
@@ -327,7 +343,11 @@ class _Grid(eqx.Module):
 
 
 def _insert_new(
-    vmap: VoxelMap, points: Float[Array, "m 3"], mask: Bool[Array, " m"], grid: _Grid
+    vmap: VoxelMap,
+    points: Float[Array, "m 3"],
+    mask: Bool[Array, " m"],
+    grid: _Grid,
+    sensor: Float[Array, "3"] | None,
 ) -> tuple[VoxelMap, Bool[Array, " m"], Bool[Array, " m"]]:
     """Insert one batch; return the map, which points filled a cell, and which found no slot."""
     capacity = vmap.voxel.shape[0]
@@ -346,10 +366,15 @@ def _insert_new(
     word, bit = _word_and_bit(cell)
     cells = cells.at[target, word].add(bit, mode="drop")
 
-    mean, diagonal, off_diagonal = mean_and_covariance(_take(moments, jnp.maximum(slot, 0)))
+    held = jnp.maximum(slot, 0)
+    mean, diagonal, off_diagonal = mean_and_covariance(_take(moments, held))
     variances, normal = eigenvalues_and_normal3(diagonal, off_diagonal)
-    count = _take(moments, (jnp.maximum(slot, 0), 0))
-    centroid = jnp.concatenate([mean, count[:, None]], -1)
+    count = _take(moments, (held, 0))
+    signed = count
+    if sensor is not None:
+        way = mean - offset + points - sensor.astype(points.dtype)
+        signed = jnp.where(_contained(way, count, normal, variances), -count, count)
+    centroid = jnp.concatenate([mean, signed[:, None]], -1)
     plane = jnp.concatenate([normal, jnp.maximum(variances[:, :2], 0.0)], -1)
     vmap = VoxelMap(
         table_voxel,
@@ -359,6 +384,21 @@ def _insert_new(
         vmap.plane.at[target].set(plane, mode="drop"),
     )
     return vmap, fills, homeless
+
+
+def _contained(
+    way: Float[Array, "m 3"],
+    count: Float[Array, " m"],
+    normal: Float[Array, "m 3"],
+    variances: Float[Array, "m 3"],
+) -> Bool[Array, " m"]:
+    """Return which planes contain the way from the sensor to the mean of their points.
+
+    A plane through n points is tilted about its longest axis by the variance l0 / ((n - 3) l1).
+    """
+    flat, wide = jnp.maximum(variances[:, 0], _LEAST_SPREAD**2), variances[:, 1]
+    scaled = dot3(way, normal) ** 2 * jnp.maximum(count - _PLANE_DOF, 1.0) * wide
+    return scaled < _CLEAR**2 * flat * dot3(way, way)
 
 
 def _held(vmap: VoxelMap, slot: Int32[Array, " m"], cell: Int32[Array, "m 3"]) -> Bool[Array, " m"]:
@@ -409,11 +449,9 @@ def _one_per_cell(wants: Bool[Array, " m"], cell: Int32[Array, "m 3"]) -> Bool[A
     return wants & (winner.at[ticket].get(mode="fill", fill_value=-1) == order)
 
 
-def _mean(
-    vmap: VoxelMap, slot: Int32[Array, "*b"], local: Int32[Array, "*b 3"], voxel_size: Float[Array, ""]
-) -> Float[Array, "*b 3"]:
-    """Return the means, m, in the anchored frame, of slots that hold the voxels ``local`` of that frame."""
-    return (local.astype(voxel_size.dtype) + 0.5) * voxel_size + _take(vmap.centroid, slot)[..., :3]
+def _centre(local: Int32[Array, "*b 3"], voxel_size: Float[Array, ""]) -> Float[Array, "*b 3"]:
+    """Return the centres, m, of voxels in the anchored frame."""
+    return (local.astype(voxel_size.dtype) + 0.5) * voxel_size
 
 
 def mean_and_covariance(moments: Float[Array, "*b 10"]) -> tuple[Array, Array, Array]:

@@ -176,7 +176,13 @@ def step(
         # XLA copies a map that is read after it is written: what has read it comes first
         inserted, by_noise = computed_once((inserted, by_noise))
         vmap, added = insert(
-            state.map, placed, inserted, frame.anchor, size, params.map.reach.astype(jnp.float32)
+            state.map,
+            placed,
+            inserted,
+            frame.anchor,
+            size,
+            params.map.reach.astype(jnp.float32),
+            T_matched.translation() - frame.origin,
         )
         again = _PlacedAgain(path, prior.nav.T_imu_lidar, thin, T_matched, frame)
         vmap = following(vmap, state.map, added.added, placed, inserted, again, frame.anchor, size)

@@ -70,6 +70,10 @@ class Matches(eqx.Module):
         )
 
 
+_SURFACE_SHARE = 1 / 3
+"""Share of the matches that have to lie on surfaces; see :func:`associate`."""
+
+
 def associate(
     vmap: VoxelMap,
     points: Float[Array, "k 3"],
@@ -78,7 +82,12 @@ def associate(
     frame: Frame,
     map_params: VoxelMapParams,
 ) -> Matches:
-    """Return the distribution of the map that each point lies on at a pose."""
+    """Return the distribution of the map that each point lies on at a pose.
+
+    A plane of beams, which contains the sensor that saw it (:func:`lio_jax.mapping.voxel_map.insert`), is no
+    match: it hides a turn of the sensor, and contradicts the pose once the vehicle has moved. Where less than
+    a third of the matches would be left, all planes count.
+    """
     _, placed = frame.place(jnp.where(mask[:, None], points, 0.0), T_world_lidar)
     near = query_nearest(
         vmap,
@@ -87,7 +96,11 @@ def associate(
         map_params.voxel_size.astype(jnp.float32),
         map_params.min_points.astype(jnp.float32),
     )
-    return Matches(near.mean, near.normal, near.variances, near.count, near.slot, mask & near.valid)
+    met = mask & near.valid
+    surfaces = met & near.surface
+    enough = jnp.sum(surfaces) >= _SURFACE_SHARE * jnp.sum(met)
+    used = jnp.where(enough, surfaces, met)
+    return Matches(near.mean, near.normal, near.variances, near.count, near.slot, used)
 
 
 def no_matches(mask: Bool[Array, " k"], dtype: DTypeLike) -> Matches:

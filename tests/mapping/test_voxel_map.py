@@ -295,3 +295,43 @@ def test_anchor_is_the_voxel_below_the_position(position):
     assert ((offset >= -1e-9) & (offset < VOXEL + 1e-9)).all()
     np.testing.assert_allclose(np.asarray(anchor) * VOXEL, corner, rtol=1e-15)
     assert corner.dtype == jnp.float64
+
+
+def seen_from(points: np.ndarray, sensor: np.ndarray | None, vmap: VoxelMap | None = None) -> VoxelMap:
+    vmap = empty_map(64) if vmap is None else vmap
+    points, mask = jnp.asarray(points, jnp.float32), jnp.ones(len(points), bool)
+    where = None if sensor is None else jnp.asarray(sensor, jnp.float32)
+    size, reach = jnp.float32(VOXEL), jnp.float32(1000)
+    return insert(vmap, points, mask, jnp.zeros(3, jnp.int32), size, reach, where)[0]
+
+
+def is_surface(vmap: VoxelMap) -> bool:
+    near = jnp.full((1, 3), 0.6, jnp.float32)
+    found = query_nearest(vmap, near, jnp.zeros(3, jnp.int32), jnp.float32(VOXEL), jnp.float32(1))
+    assert found.valid[0]
+    assert found.count[0] > 0
+    return bool(found.surface[0])
+
+
+def test_a_plane_that_contains_its_sensor_is_no_surface_until_it_is_seen_from_elsewhere():
+    """One beam of a turning sensor at height 0.6 m sweeps around the corner of a house."""
+    along = np.linspace(0.05, 1.15, 8)
+    corner = np.concatenate([np.stack([np.full(8, 0.1), along], -1), np.stack([along, np.full(8, 0.1)], -1)])
+    swept = np.column_stack([corner, 0.6 + 0.005 * np.sin(np.arange(16.0))])
+    sensor = np.array([-20.0, -15.0, 0.6])
+    assert not is_surface(seen_from(swept, sensor))
+    assert is_surface(seen_from(swept, None))
+    assert is_surface(seen_from(swept, sensor + np.array([0, 0, 8.0])))
+    # a floor is there after all
+    x, y = np.meshgrid(along, along)
+    floor = np.column_stack([x.ravel(), y.ravel(), 0.6 + 0.005 * np.cos(np.arange(64.0))])
+    above = np.array([-2.0, -1.0, 2.4])
+    assert is_surface(seen_from(floor, above, seen_from(swept, sensor)))
+
+
+def test_a_plane_is_a_surface_where_the_sensor_of_some_points_is_not_known():
+    rng = np.random.default_rng(5)
+    edge_on = np.column_stack([rng.uniform(0.05, 1.15, (40, 2)), 0.6 + rng.normal(0, 0.01, 40)])
+    sensor = np.array([-20.0, -15.0, 0.6])
+    assert not is_surface(seen_from(edge_on, sensor))
+    assert is_surface(seen_from(edge_on[20:], sensor, seen_from(edge_on[:20], None)))
