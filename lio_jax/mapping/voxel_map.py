@@ -5,8 +5,6 @@ precise at any distance from the world's origin. Points are given in an *anchore
 a whole number of voxels, such that the vehicle is near the origin.
 """
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,9 +14,8 @@ from jaxtyping import Array, Bool, Float, Int32, UInt32
 
 from lio_jax.core.geometry import dot3, eigenvalues_and_normal3
 from lio_jax.core.hashing import voxel_hash
-from lio_jax.core.implicit import with_derivative_of
 from lio_jax.core.prefix_sum import running_count
-from lio_jax.core.xla import added_in_place, computed_once
+from lio_jax.core.xla import computed_once
 
 WAYS = 2
 """Number of slots that a voxel may lie in. They are neighbours in memory, so that both are read together."""
@@ -49,8 +46,8 @@ class VoxelMap(eqx.Module):
     cells: UInt32[Array, "c 2"]
     """Bit set of the cells that hold a point."""
     centroid: Float[Array, "c 4"]
-    """Mean of the points relative to the voxel's centre, m, and their number, negative where the
-    sensor lay in their plane. A look-up compares these."""
+    """Mean of the points relative to the voxel's centre, m, and their number, negative where their plane
+    contains the sensor. A look-up compares these."""
     plane: Float[Array, "c 5"]
     """Unit normal, and the two smaller variances, ascending, m^2. A match uses these."""
 
@@ -143,8 +140,8 @@ def query_nearest(
     local = own.astype(jnp.int32) + _OFFSETS[:, None] * side
     slots = computed_once(find_slots(vmap, local + anchor))
     held = jnp.maximum(slots, 0)
-    away = points - _centre(local, voxel_size) - _take(vmap.centroid, held)[..., :3]
-    usable = (slots >= 0) & (jnp.abs(_take(vmap.centroid, (held, 3))) >= min_points)
+    away = points - _centre(local, voxel_size) - take(vmap.centroid, held)[..., :3]
+    usable = (slots >= 0) & (jnp.abs(take(vmap.centroid, (held, 3))) >= min_points)
     squared = jnp.where(usable, away[..., 0] ** 2 + away[..., 1] ** 2 + away[..., 2] ** 2, jnp.inf)
     distance, nearest = jnp.full_like(squared[0], jnp.inf), jnp.full_like(slots[0], -1)
     for other, slot in zip(squared, slots, strict=True):
@@ -152,10 +149,10 @@ def query_nearest(
         distance = jnp.minimum(other, distance)
     nearest = computed_once(nearest)
     found = jnp.maximum(nearest, 0)
-    plane, centroid = _take(vmap.plane, found), computed_once(_take(vmap.centroid, found))
+    plane, centroid = take(vmap.plane, found), computed_once(take(vmap.centroid, found))
     count = centroid[:, 3]
     return VoxelPlanes(
-        mean=_centre(_take(vmap.voxel, found) - anchor, voxel_size) + centroid[:, :3],
+        mean=_centre(take(vmap.voxel, found) - anchor, voxel_size) + centroid[:, :3],
         normal=plane[:, :3],
         variances=plane[:, 3:],
         count=jnp.abs(count),
@@ -195,7 +192,7 @@ def insert(
     """
     count = points.shape[0]
     vmap, points, sensor = jax.lax.stop_gradient((vmap, points.astype(vmap.moments.dtype), sensor))
-    grid = _Grid(anchor, voxel_size.astype(points.dtype), reach)
+    grid = VoxelGrid(anchor, voxel_size.astype(points.dtype), reach)
     voxel, cell, _ = grid.places(points)
     slot = computed_once(find_slots(vmap, voxel))
     new = mask & ~((slot >= 0) & _held(vmap, slot, cell))
@@ -210,7 +207,7 @@ def insert(
         vmap, added, dropped = carry
         index = jax.lax.dynamic_slice(waiting, (number * batch,), (batch,))
         row = jnp.minimum(index, count - 1)
-        vmap, fills, homeless = _insert_new(vmap, _take(points, row), index < count, grid, sensor)
+        vmap, fills, homeless = _insert_new(vmap, take(points, row), index < count, grid, sensor)
         added = added.at[jnp.where(fills, index, count)].set(True, mode="drop")
         return vmap, added, dropped + jnp.sum(homeless, dtype=jnp.int32)
 
@@ -220,89 +217,7 @@ def insert(
     return vmap, Insertion(added, dropped)
 
 
-def following(
-    vmap: VoxelMap,
-    before: VoxelMap,
-    added: Bool[Array, " m"],
-    points: Float[Array, "m 3"],
-    mask: Bool[Array, " m"],
-    placed_again: Callable[[Int32[Array, " n"]], Float[Array, "n 3"]],
-    anchor: Int32[Array, "3"],
-    voxel_size: Float[Array, ""],
-) -> VoxelMap:
-    """Return the map after an insertion with the derivative of its moments.
-
-    The moments depend on those before and on the points that were added. Which points fill a cell and which
-    voxel gets which slot are choices, which the derivative holds.
-
-    Args:
-        vmap: the map after :func:`insert`.
-        before: the map before; its moments may have a derivative.
-        added: which of the m points filled an empty cell.
-        points: as they were inserted, m, in the anchored frame.
-        mask: which of them were real.
-        placed_again: ``rows -> (n, 3)``: the points of these rows, computed once more for their derivative. A
-            pytree.
-        anchor: voxel whose lower corner is the origin of ``points``.
-        voxel_size: edge length, m.
-    """
-    still = jax.lax.stop_gradient(vmap)
-    choices = jax.lax.stop_gradient((before.voxel, still, added, points, mask, anchor, voxel_size))
-    moments = with_derivative_of(still.moments, _moments_after, before.moments, placed_again, choices)
-    return eqx.tree_at(lambda one: one.moments, still, moments)
-
-
-_CHUNK = 1024
-"""Number of points whose changes are worked out at a time; most scans add few."""
-
-
-def _moments_after(
-    before: Float[Array, "c 10"], placed_again: Callable[[Array], Array], choices: tuple
-) -> Float[Array, "c 10"]:
-    """Return the moments after an insertion whose choices are known."""
-    old, vmap, added, points, mask, anchor, voxel_size = choices
-    capacity, count, dtype = len(old), len(added), before.dtype
-    points, voxel_size = points.astype(dtype), voxel_size.astype(dtype)
-    grid = _Grid(anchor, voxel_size, voxel_size)
-    voxel, _, _ = grid.places(points)
-    slot = find_slots(vmap, voxel)
-    held = jnp.maximum(slot, 0)
-    order = jnp.arange(count, dtype=jnp.int32)
-    forgotten = _take(old, held)
-    fresh = mask & (slot >= 0) & jnp.any(forgotten != voxel, axis=1) & (forgotten[:, 0] != FREE)
-    # of all points of a fresh voxel one takes away what its slot held before
-    first = jnp.full(capacity, count, jnp.int32).at[jnp.where(fresh, slot, capacity)].min(order, mode="drop")
-    clears = fresh & (_take(first, held) == order)
-    touched = clears | added
-    total = jnp.sum(touched, dtype=jnp.int32)
-    size = min(_CHUNK, count)
-    padded = -(-count // size) * size
-    place = jnp.where(touched, running_count(touched) - 1, padded)
-    rows = computed_once(jnp.zeros(padded, jnp.int32).at[place].set(order, mode="drop"))
-    slots, clearing = _take(held, rows), _take(clears, rows)
-
-    def gained(some: Array) -> Array:
-        # the module is an argument, because its arrays have a derivative
-        again = with_derivative_of(
-            _take(points, some), lambda place, rows: place(rows).astype(dtype), placed_again, some
-        )
-        _, _, offset = grid.places(again)
-        return jnp.where(_take(added, some)[:, None], _moment_row(offset), 0.0)
-
-    def chunk(number: Array) -> Array:
-        some = jax.lax.dynamic_slice(rows, (number * size,), (size,))
-        return jax.lax.cond(number * size < total, gained, lambda rows: jnp.zeros((size, 10), dtype), some)
-
-    def lost(before: Array) -> Array:
-        return jnp.where(clearing[:, None], _take(before, slots), 0.0)
-
-    gains = jax.lax.map(chunk, jnp.arange(padded // size)).reshape(padded, 10)
-    # few scans overwrite voxels
-    losses = jax.lax.cond(jnp.any(clears), lost, lambda before: jnp.zeros((padded, 10), dtype), before)
-    return added_in_place(before, slots, gains - losses, total)
-
-
-def _moment_row(offset: Float[Array, "m 3"]) -> Float[Array, "m 10"]:
+def moment_row(offset: Float[Array, "m 3"]) -> Float[Array, "m 10"]:
     """Return what a point adds to the moments of its voxel, given its offset from the voxel's centre, m."""
     x, y, z = jnp.moveaxis(offset, -1, 0)
     return jnp.stack([jnp.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z], -1)
@@ -319,12 +234,12 @@ def find_slots(vmap: VoxelMap, voxel: Int32[Array, "*b 3"]) -> Int32[Array, "*b"
     slot = jnp.full(voxel.shape[:-1], -1, jnp.int32)
     for way in range(WAYS):
         candidate = first + way
-        same = _take(vmap.voxel, candidate) == voxel
+        same = take(vmap.voxel, candidate) == voxel
         slot = jnp.where(same[..., 0] & same[..., 1] & same[..., 2], candidate, slot)
     return slot
 
 
-class _Grid(eqx.Module):
+class VoxelGrid(eqx.Module):
     """The grid of the table, seen from an anchor."""
 
     anchor: Int32[Array, "3"]
@@ -346,7 +261,7 @@ def _insert_new(
     vmap: VoxelMap,
     points: Float[Array, "m 3"],
     mask: Bool[Array, " m"],
-    grid: _Grid,
+    grid: VoxelGrid,
     sensor: Float[Array, "3"] | None,
 ) -> tuple[VoxelMap, Bool[Array, " m"], Bool[Array, " m"]]:
     """Insert one batch; return the map, which points filled a cell, and which found no slot."""
@@ -362,14 +277,14 @@ def _insert_new(
 
     fills = _one_per_cell((slot >= 0) & ~_held(vmap, slot, cell), voxel * SUBDIVISION + cell)
     target = computed_once(jnp.where(fills, slot, capacity))
-    moments = moments.at[target].add(_moment_row(offset), mode="drop")
+    moments = moments.at[target].add(moment_row(offset), mode="drop")
     word, bit = _word_and_bit(cell)
     cells = cells.at[target, word].add(bit, mode="drop")
 
     held = jnp.maximum(slot, 0)
-    mean, diagonal, off_diagonal = mean_and_covariance(_take(moments, held))
+    mean, diagonal, off_diagonal = mean_and_covariance(take(moments, held))
     variances, normal = eigenvalues_and_normal3(diagonal, off_diagonal)
-    count = _take(moments, (held, 0))
+    count = take(moments, (held, 0))
     signed = count
     if sensor is not None:
         way = mean - offset + points - sensor.astype(points.dtype)
@@ -404,7 +319,7 @@ def _contained(
 def _held(vmap: VoxelMap, slot: Int32[Array, " m"], cell: Int32[Array, "m 3"]) -> Bool[Array, " m"]:
     """Return which points' cells hold a point already; ``slot`` is -1 where the map has no such voxel."""
     word, bit = _word_and_bit(cell)
-    return (_take(vmap.cells, (jnp.maximum(slot, 0), word)) & bit) != 0
+    return (take(vmap.cells, (jnp.maximum(slot, 0), word)) & bit) != 0
 
 
 def _word_and_bit(cell: Int32[Array, "m 3"]) -> tuple[Int32[Array, " m"], UInt32[Array, " m"]]:
@@ -426,17 +341,17 @@ def _claim_slots(
     for way in range(WAYS):
         candidate = first + way
         # as floats, because the integer coordinates of a free slot would overflow; they count as far away
-        apart = _take(vmap.voxel, candidate).astype(jnp.float32) - anchor.astype(jnp.float32)
+        apart = take(vmap.voxel, candidate).astype(jnp.float32) - anchor.astype(jnp.float32)
         open_slot = dot3(apart, apart) > reach**2
-        asks = homeless & open_slot & (_take(claims, candidate) < 0)
+        asks = homeless & open_slot & (take(claims, candidate) < 0)
         claims = claims.at[jnp.where(asks, candidate, capacity)].max(order, mode="drop")
-        winner = _take(claims, candidate)
-        housed = homeless & (winner >= 0) & jnp.all(_take(voxel, jnp.maximum(winner, 0)) == voxel, -1)
+        winner = take(claims, candidate)
+        housed = homeless & (winner >= 0) & jnp.all(take(voxel, jnp.maximum(winner, 0)) == voxel, -1)
         slot = jnp.where(housed, candidate, slot)
         fresh |= housed
         homeless &= ~housed
     # another voxel may have claimed the slot of a voxel beyond reach: the latter must not write into it
-    evicted = (slot >= 0) & ~fresh & (_take(claims, jnp.maximum(slot, 0)) >= 0)
+    evicted = (slot >= 0) & ~fresh & (take(claims, jnp.maximum(slot, 0)) >= 0)
     return jnp.where(evicted, -1, slot), fresh, homeless | evicted
 
 
@@ -471,5 +386,6 @@ def _first_slot(vmap: VoxelMap, voxel: Int32[Array, "*b 3"]) -> Int32[Array, "*b
     return ((voxel_hash(voxel) & jnp.uint32(buckets - 1)) * WAYS).astype(jnp.int32)
 
 
-def _take(table: Array, index: Array | tuple[Array | int, ...]) -> Array:
+def take(table: Array, index: Array | tuple[Array | int, ...]) -> Array:
+    """Return entries of a table that are known to lie in it."""
     return table.at[index].get(mode="promise_in_bounds")

@@ -19,7 +19,8 @@ from lio_jax.estimation.map_drift import MapDrift
 from lio_jax.imu.path import Path, deskew_along
 from lio_jax.lidar.thinning import ThinnedScan, rows_of, thinned
 from lio_jax.mapping.frame import Frame
-from lio_jax.mapping.voxel_map import VoxelMap, empty_map, following, insert
+from lio_jax.mapping.voxel_map import VoxelMap, empty_map, insert
+from lio_jax.mapping.voxel_tangents import following
 from lio_jax.recipes import recipe
 from lio_jax.recipes.constant_velocity import mean_rate
 from lio_jax.recipes.default_params import DefaultConfig, DefaultParams

@@ -15,7 +15,8 @@ from lio_jax.core.types import LOST, NavState, Scan, initial_nav_state
 from lio_jax.lidar.deskew import TrialMotion, deskew_constant_velocity, twist_without_turn
 from lio_jax.lidar.thinning import ThinnedScan, rows_of, thinned
 from lio_jax.mapping.frame import Frame
-from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, following, insert
+from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
+from lio_jax.mapping.voxel_tangents import following
 from lio_jax.recipes import recipe
 from lio_jax.recipes.default_params import DefaultConfig, DefaultParams
 from lio_jax.recipes.lidar_covariance import LidarCovariance, ScanOnMap, mean_squared_range

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from lio_jax.mapping import point_map
-from lio_jax.mapping.voxel_map import FREE, empty_map, following, insert
+from lio_jax.mapping.voxel_map import FREE, empty_map, insert
+from lio_jax.mapping.voxel_tangents import following
 
 SIZE, REACH = jnp.float64(1.0), jnp.float64(40.0)
 RNG = np.random.default_rng(3)
