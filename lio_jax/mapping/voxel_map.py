@@ -28,7 +28,8 @@ _CLEAR = 2.0
 """Standard deviations of its tilt by which a plane has to pass beside the sensor that saw it."""
 _LEAST_SPREAD = 3e-3
 """Least standard deviation of points about their plane, m: few may lie on one by chance."""
-_PLANE_DOF = 3
+PLANE_DOF = 3
+"""A plane through so many points shows none of their noise."""
 _BATCH = 4096
 """Number of points inserted at a time. Most scans have fewer new points, and need one batch."""
 _OFFSETS = np.concatenate([np.zeros((1, 3), np.int32), np.eye(3, dtype=np.int32)])
@@ -312,7 +313,7 @@ def _contained(
     A plane through n points is tilted about its longest axis by the variance l0 / ((n - 3) l1).
     """
     flat, wide = jnp.maximum(variances[:, 0], _LEAST_SPREAD**2), variances[:, 1]
-    scaled = dot3(way, normal) ** 2 * jnp.maximum(count - _PLANE_DOF, 1.0) * wide
+    scaled = dot3(way, normal) ** 2 * jnp.maximum(count - PLANE_DOF, 1.0) * wide
     return scaled < _CLEAR**2 * flat * dot3(way, way)
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from lio_jax.lidar.params import BeamParams
 from lio_jax.mapping.frame import Frame
-from lio_jax.mapping.voxel_map import VoxelMap, mean_and_covariance
+from lio_jax.mapping.voxel_map import PLANE_DOF, VoxelMap, mean_and_covariance
 from lio_jax.registration.params import RobustFilterMatch
 from lio_jax.registration.point_sums import point_sums
 from lio_jax.registration.scan_match import NormalEquations
@@ -29,8 +29,6 @@ class PointEvidence(eqx.Module):
     """Variance of the pose by the planes' errors, as a share of its variance by the scan's own noise."""
 
 
-_PLANE_DOF = 3
-"""A plane through so many points shows none of their noise."""
 _EVERY = 4
 """One of so many points is enough for a mean over all."""
 _UNSHARED = 2
@@ -114,7 +112,7 @@ def _shared(slots: int, matches: Matches, kind: jnp.dtype, every: int = 1) -> Fl
     """
     others = every * (matches.in_same_voxel(slots) - 1)
     together = jnp.where(matches.used, 1 + others, 0).astype(kind)
-    alone = _UNSHARED / jnp.maximum(matches.count - _PLANE_DOF, 1)
+    alone = _UNSHARED / jnp.maximum(matches.count - PLANE_DOF, 1)
     return together * alone / jnp.maximum(jnp.sum(matches.used), 1)
 
 
@@ -244,7 +242,7 @@ def tilt_covariance(
     flat, wide = variances.T
     longest = jnp.sum(diagonal, -1) - flat - wide
     first, second = jnp.maximum(wide - flat, _LEAST), jnp.maximum(longest - flat, _LEAST)
-    of_mean = jnp.maximum(flat / jnp.maximum(count - _PLANE_DOF, 1), noise / jnp.maximum(count, 1))
+    of_mean = jnp.maximum(flat / jnp.maximum(count - PLANE_DOF, 1), noise / jnp.maximum(count, 1))
     # C - l0 I is zero along the normal; within the plane its inverse follows by Cayley and Hamilton
     both = first + second
     scale = of_mean / (first * second + of_mean * both)

@@ -70,6 +70,14 @@ def sample(surfaces: list[Surface], count: int, sigma: float, seed: int, reach: 
     return points[:count] + rng.normal(0, sigma, (count, 3))
 
 
+def beams(elevations_deg: np.ndarray, columns: int) -> np.ndarray:
+    """Return the unit vectors (n, 3) of a turning sensor's beams, column after column."""
+    turns = np.arange(columns) * (2 * np.pi / columns)
+    elevation, azimuth = np.meshgrid(np.radians(elevations_deg), turns)
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], -1).reshape(-1, 3)
+
+
 def params_with(**paths: float) -> Params:
     """Return the default parameters with changes, for example ``lidar__range_sigma=0.02``."""
     values = {section: dict(leaves) for section, leaves in DEFAULTS.items()}

@@ -9,7 +9,7 @@ import numpy as np
 
 from lio_jax.mapping.voxel_map import VoxelMap, anchor_of, empty_map, insert
 from lio_jax.registration.voxel_planes import Matches, PointNoise, ScanToVoxels, point_noise
-from tests.registration.scenes import params_with, pose
+from tests.registration.scenes import beams, params_with, pose
 
 PARAMS = params_with()
 NOISE, HEIGHT, FORWARD = 0.01, 1.8, 1.2
@@ -23,10 +23,7 @@ HERE, THERE = jaxlie.SE3.identity(), pose([FORWARD, 0, 0], [0, 0, 0])
 def sweep(x: float, seed: int) -> np.ndarray:
     """Return what 16 beams see of a street whose houses stand nearer and nearer to its middle, from x, m."""
     rng = np.random.default_rng(seed)
-    turns = np.arange(1800) * (np.pi / 900)
-    elevation, azimuth = np.meshgrid(np.radians(np.arange(-15.0, 16.0, 2.0)), turns)
-    level = np.cos(elevation)
-    beam = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], -1).reshape(-1, 3)
+    beam = beams(np.arange(-15.0, 16.0, 2.0), 1800)
     with np.errstate(divide="ignore", invalid="ignore"):
         reaches = [np.where(beam[:, 2] < 0, -HEIGHT / beam[:, 2], np.inf)]
         # walls along the street recede at the corners; walls across it face the sensor there
@@ -43,14 +40,14 @@ def sweep(x: float, seed: int) -> np.ndarray:
 
 
 @partial(jax.jit, static_argnums=1)
-def map_of_standing(scans: jax.Array, told: bool) -> VoxelMap:
+def map_of_standing(scans: jax.Array, known: bool) -> VoxelMap:
     """Return the map of a sensor that stands at the origin, whose position the map is given or not."""
     anchor, corner = anchor_of(jnp.zeros(3), PARAMS.map.voxel_size)
     vmap, size = empty_map(65536), PARAMS.map.voxel_size.astype(jnp.float32)
     for points in scans:
         mask = jnp.any(points != 0, axis=1)
         placed = points - corner.astype(jnp.float32)
-        vmap, _ = insert(vmap, placed, mask, anchor, size, jnp.float32(100), -corner if told else None)
+        vmap, _ = insert(vmap, placed, mask, anchor, size, jnp.float32(100), -corner if known else None)
     return vmap
 
 
@@ -88,11 +85,11 @@ def test_far_corners_tell_nothing_of_the_height():
     moved = scans_of(FORWARD, range(90, 91))[0]
     far = np.linalg.norm(moved, axis=1) > 18
 
-    def information(told: bool) -> np.ndarray:
+    def information(known: bool) -> np.ndarray:
         """Return the information that far points give on the height, 1/m^2, and the wrong part of it."""
         sums = np.zeros(2)
         for first in (0, 10, 20, 30):
-            vmap = map_of_standing(scans_of(0.0, range(first, first + 5)), told)
+            vmap = map_of_standing(scans_of(0.0, range(first, first + 5)), known)
             found, noise = associated(vmap, moved, THERE)
             each = np.where(far, noise.precision * found.normal[:, 2] ** 2, 0.0)
             sums += each.sum(), each[np.abs(noise.distance) > 5 * NOISE].sum()
@@ -116,5 +113,5 @@ def test_planes_of_beams_have_no_match_unless_there_is_hardly_any_other():
     # far points alone lie in voxels of one scan line each
     far = jnp.where(jnp.linalg.norm(scans[0], axis=1, keepdims=True) > 22, scans[0], 0)
     alone = far[None]
-    (every, _), (some, _) = (associated(map_of_standing(alone, told), far, HERE) for told in (False, True))
+    (every, _), (some, _) = (associated(map_of_standing(alone, known), far, HERE) for known in (False, True))
     np.testing.assert_array_equal(every.used, some.used)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from lio_jax.mapping.voxel_map import VoxelMap
 from lio_jax.registration.gauss_newton import gauss_newton
 from lio_jax.registration.voxel_planes import Matches, ScanToVoxels
-from tests.registration.scenes import map_of, params_with
+from tests.registration.scenes import beams, map_of, params_with
 
 PARAMS = params_with()
 NOISE, PITCH, POINTS = 0.02, 4e-3, 8500
@@ -22,10 +22,7 @@ HERE = jaxlie.SE3.identity()
 def sweep(pitch: float, seed: int) -> np.ndarray:
     """Return what 32 beams see between two walls, 16 m apart and 8 m high; the noise lies along the beams."""
     rng = np.random.default_rng(seed)
-    turns = np.arange(1200) * (np.pi / 600)
-    elevation, azimuth = np.meshgrid(np.radians(np.linspace(-25.0, 15.0, 32)), turns)
-    level = np.cos(elevation)
-    beam = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], -1).reshape(-1, 3)
+    beam = beams(np.linspace(-25.0, 15.0, 32), 1200)
     seen = beam @ Rotation.from_euler("y", pitch).as_matrix().T
     with np.errstate(divide="ignore"):
         to_ground = np.where(seen[:, 2] < 0, -1.8 / seen[:, 2], np.inf)
