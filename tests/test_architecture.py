@@ -165,7 +165,7 @@ def test_what_the_package_imports_is_installed_with_it():
 
 
 MODULES = {module_name(path): path for path in FILES}
-MOST_MODULES = 309
+MOST_MODULES = 310
 """Limit of the number of files: a new one earns its place, or another one goes."""
 
 

@@ -76,7 +76,7 @@ def driven(options: argparse.Namespace) -> dict[str, Any]:
         "keyframes": watch.keyframes,
         "keyframes_mb": watch.keyframes_mb,
         "end_s": ended - watch.last,
-        "loops": found.get("loops", {}).get("accepted", 0),
+        "loops": found["loops"]["closed"],
         "path_m": evaluate(run.odometry, truth).path_length_m,
         "odometry_ate_m": evaluate(run.odometry, truth).ate.rmse,
         "ate_m": evaluate(run.trajectory, truth).ate.rmse,

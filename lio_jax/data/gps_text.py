@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.core.files import read_text
 from lio_jax.data.cloud_stamps import times_to_ns
 from lio_jax.data.enu import geodetic_to_enu
 from lio_jax.data.sequence import GpsData
+from lio_jax.data.text_table import read_text_table
 
 _COLUMNS = (
     "t, x, y, z (local, m) or t, latitude, longitude, altitude (deg, m), then sigma or three sigmas (m)"
@@ -32,39 +32,24 @@ def read_gps_text(path: Path) -> GpsData:
             does not ascend.
     """
     remedy = f"give a table with the columns {_COLUMNS}"
-    lines = [
-        (number, line.replace(",", " ").split())
-        for number, line in enumerate(read_text(path, remedy).splitlines(), 1)
-        if line.strip()
-    ]
-    names = ""
-    while lines and not _is_number(lines[0][1][0]):
-        names = _UNIT.sub("", " ".join(lines.pop(0)[1])).lower()
-    if not lines:
-        raise LioJaxError(f"{path}: holds no fixes; {remedy}.")
-    width = len(lines[0][1])
+    names, lines, words, table = read_text_table(path, "fixes", remedy)
+    width = table.shape[1]
     if width not in (4, 5, 7):
         raise LioJaxError(f"{path}: has {width} columns, not 4, 5 or 7; {remedy}.")
-    rows = []
-    for number, words in lines:
-        row = [float(word) if _is_number(word) else np.nan for word in words]
-        if len(row) != width or not np.isfinite(row).all():
-            raise LioJaxError(
-                f"{path}: line {number} does not hold {width} finite numbers; fix or remove it."
-            )
-        rows.append(row)
-    table = np.array(rows)
+    if not (finite := np.isfinite(table).all(axis=1)).all():
+        line = lines[int(np.argmin(finite))]
+        raise LioJaxError(f"{path}: line {line} does not hold {width} finite numbers; fix or remove it.")
     try:
-        stamps = np.array(times_to_ns([words[0] for _, words in lines], _PERIOD_NS), np.int64)
+        stamps = np.array(times_to_ns([row[0] for row in words], _PERIOD_NS), np.int64)
     except ValueError as error:
         raise LioJaxError(f"{path}: {error}; give times in seconds or whole ns.") from None
     if (np.diff(stamps) <= 0).any():
-        line = lines[int(np.argmax(np.diff(stamps) <= 0)) + 1][0]
+        line = lines[int(np.argmax(np.diff(stamps) <= 0)) + 1]
         raise LioJaxError(
             f"{path}: time does not ascend at line {line}; sort the file and remove duplicates."
         )
     position, origin = table[:, 1:4], (np.nan,) * 3
-    if _LATITUDE.search(names):
+    if names is not None and _LATITUDE.search(_UNIT.sub("", " ".join(names)).lower()):
         if (np.abs(position[:, 0]) > 90).any() or (np.abs(position[:, 1]) > 360).any():
             raise LioJaxError(f"{path}: a latitude above 90 or a longitude above 360 deg; give degrees.")
         first = position[0]
@@ -74,14 +59,6 @@ def read_gps_text(path: Path) -> GpsData:
     if width > 4:
         sigma = np.broadcast_to(table[:, 4:], sigma.shape)
         if (sigma <= 0).any():
-            line = lines[int(np.argmax((sigma <= 0).any(axis=1)))][0]
+            line = lines[int(np.argmax((sigma <= 0).any(axis=1)))]
             raise LioJaxError(f"{path}: line {line} has a standard deviation that is not positive; fix it.")
     return GpsData(stamps, position, sigma[:, :, None] ** 2 * np.eye(3), origin)
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
-from lio_jax.core.files import read_text
 from lio_jax.data.cloud_stamps import times_to_ns
 from lio_jax.data.sequence import ImuData
+from lio_jax.data.text_table import read_text_table
 
 _COLUMNS = "t, gyro_x, gyro_y, gyro_z, accel_x, accel_y, accel_z"
 _PERIOD_NS = 5_000_000
@@ -30,15 +30,8 @@ def read_imu_text(path: Path) -> tuple[ImuData, str]:
     Raises:
         LioJaxError: the table is empty, a line does not fit, or the order of the columns is not clear.
     """
-    text = read_text(path, f"give a table with the columns {_COLUMNS}")
-    lines = [(number, _words(line)) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
-    names: list[str] | None = None
-    while lines and not _is_number(lines[0][1][0]):
-        names = lines.pop(0)[1]
-    if not lines:
-        raise LioJaxError(f"{path}: holds no samples; give a table with the columns {_COLUMNS}.")
-    width = len(lines[0][1])
-    table = np.array([_row(path, number, words, width) for number, words in lines])
+    names, _, words, table = read_text_table(path, "samples", f"give a table with the columns {_COLUMNS}")
+    width = table.shape[1]
     columns = None if names is None else _named(names)
     if columns is not None and max(columns) < width:
         note = "columns by their names"
@@ -49,34 +42,11 @@ def read_imu_text(path: Path) -> tuple[ImuData, str]:
             f"{path}: the order of its {width} columns is not known; name them in the first line: {_COLUMNS}."
         )
     try:
-        stamps = times_to_ns([words[columns[0]] for _, words in lines], _PERIOD_NS)
+        stamps = times_to_ns([row[columns[0]] for row in words], _PERIOD_NS)
     except ValueError as error:
         raise LioJaxError(f"{path}: {error}; give times in seconds or whole ns.") from None
     gyro, accel = table[:, columns[1:4]], table[:, columns[4:7]]
     return ImuData(np.array(stamps, np.int64), gyro, accel), f"{path.name}: {note}"
-
-
-def _words(line: str) -> list[str]:
-    line = line.strip().lstrip("#%").strip()
-    return [word.strip() for word in (line.split(",") if "," in line else line.split())] or [""]
-
-
-def _row(path: Path, number: int, words: list[str], width: int) -> list[float]:
-    try:
-        row = [float(word) for word in words]
-    except ValueError:
-        row = []
-    if len(row) != width:
-        raise LioJaxError(f"{path}: line {number} does not hold {width} numbers; fix or remove it.")
-    return row
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _named(names: Sequence[str]) -> list[int] | None:
