@@ -129,6 +129,12 @@ def displacement(
     )
 
 
+def met(first: PlanView, centers: NDArray[np.float32]) -> int:
+    """Return how many of (k, 2) positions lie in an occupied cell of a view, or within about 0.3 m of one."""
+    nearby = _disc(1.5 * FINE, FINE)
+    return int(np.count_nonzero(_hits(first.occupied, CELL, centers, nearby).any(axis=0)))
+
+
 def refined(first: PlanView, points: NDArray[np.float32], shift: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a displacement (2,), m, moved to where most points meet others; its precision is about 0.03 m.
 

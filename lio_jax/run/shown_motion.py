@@ -18,6 +18,7 @@ from lio_jax.lidar.plan_view import (
     PlanView,
     displacement,
     leads,
+    met,
     plan_view,
     refined,
     turn,
@@ -203,6 +204,15 @@ class ShownMotion(NamedTuple):
     """Number of scans from the first of the two to the second."""
 
 
+class Agreement(NamedTuple):
+    """How much of what stands upright is where the estimated motion puts it."""
+
+    cells: int
+    """Number of cells of the later plan view in which something stands."""
+    met: int
+    """Number of those cells that meet one of the earlier view after the estimated motion."""
+
+
 class Look(NamedTuple):
     """What the comparison of two plan views shows."""
 
@@ -210,6 +220,9 @@ class Look(NamedTuple):
     """The motion; None where nothing was compared, or where it is hidden."""
     is_hidden: bool | None = None
     """Whether the views fit each other at several displacements or at none; None: nothing was compared."""
+    agreement: Agreement | None = None
+    """How the views fit at the estimated displacement; only where the motion is hidden and the estimate moves
+    by less than 2 m, so that both views show the same place."""
 
 
 class MotionCheck:
@@ -286,16 +299,22 @@ def _compared_with(
         centers = (view.centers @ turn(angle))[::every]
         return displacement(reference.view, centers + moved, _REACH, step)
 
+    def hidden() -> Look:
+        if np.linalg.norm(moved) > _SLOW_M:
+            return Look(is_hidden=True)
+        meeting = met(reference.view, view.centers + moved)
+        return Look(is_hidden=True, agreement=Agreement(len(view.centers), meeting))
+
     found, angle = compared(0.0), 0.0
     if not found.is_certain and not reference.searches_turns:
-        return _HIDDEN
+        return hidden()
     if not found.is_certain:
         every = max(1, len(view.centers) // _COARSELY)
         angle = float(max(_TURN_ERRORS, key=lambda one: compared(one, every).votes))
         straight, found = found.votes, compared(angle)
         is_turned = abs(angle) >= _LEAST_TURN_ERROR
         if not found.is_certain or (is_turned and not leads(found.votes, straight)):
-            return _HIDDEN
+            return hidden()
     shift = found.shift
     if np.linalg.norm(shift) > _UNSUSPICIOUS:
         shift = refined(reference.view, view.points @ turn(angle) + moved, shift)
@@ -311,6 +330,5 @@ def _turn_between(before: NDArray[np.float64], after: NDArray[np.float64]) -> ND
     return turned
 
 
-_HIDDEN = Look(is_hidden=True)
 _FAR = 15.0
 """Motion beyond which two views have too little in common, m."""

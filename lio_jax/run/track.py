@@ -22,7 +22,7 @@ from lio_jax.run.felt_motion import FeltMotion, FeltMotionCheck
 from lio_jax.run.journal import Journal
 from lio_jax.run.paging import Pager
 from lio_jax.run.scan_inputs import ImuFeed, InputsInTurn, ScanInput
-from lio_jax.run.shown_motion import MotionCheck, ShownMotion
+from lio_jax.run.shown_motion import Agreement, MotionCheck, ShownMotion
 from lio_jax.settings.settings import Settings
 
 
@@ -55,6 +55,8 @@ class ScanResult:
     """What plan views show of the motion since an earlier scan; None where it was not compared."""
     motion_is_hidden: bool | None = None
     """Whether that comparison shows no motion without doubt; None where nothing was compared."""
+    agreement: Agreement | None = None
+    """Where it shows none and the estimate moves little: how much of what stands upright stays in place."""
     felt_motion: FeltMotion | None = None
     """How the estimated motion differs from what inertial samples feel; None where it was not compared."""
     has_imu: bool = False
@@ -194,6 +196,7 @@ class ResultBuilder:
             beams=None if fed.index % _BEAMS_EVERY else beams_of(fed.scan),
             shown_motion=look.shown,
             motion_is_hidden=look.is_hidden,
+            agreement=look.agreement,
             felt_motion=self._felt(fed.end_ns, fed.scan, fed.imu, nav, T_world_imu, breaks),
             has_imu=fed.imu is not None,
             outage=self._outages(fed.end_ns, evidence, output.covariance),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lio_jax.core.types import CONVERGED, ITERATION_LIMIT
 from lio_jax.run.failures import largest_sigma
+from lio_jax.run.shown_motion import Agreement
 from lio_jax.run.sinks import RunResult, Sink
 from lio_jax.run.track import ScanResult
 from lio_jax.settings.settings import Settings
@@ -56,6 +57,10 @@ _SIGMAS = 4.0
 _BY_NOISE_M = 0.25
 """Estimated motion in a direction that noise alone may show that counts, m: half of the error that a warning
 is to precede. The motion in truth may be none."""
+_MISPLACED_CELLS, _MISPLACED_SHARE = 40, 0.1
+"""Number of cells in which something stands that successive plan views must show, and the largest share of
+them that the estimated motion puts where something stood before, if it is wrong. Right motions reach 0.5, and
+0.15 where almost nothing stands upright."""
 _HIDDEN_LOOKS = 2
 """Number of successive plan views without a certain motion from which it counts as hidden."""
 
@@ -80,6 +85,8 @@ class _Evidence:
     hidden_since_s: float = 0.0
     hidden_looks: int = 0
     shown_step: float = 0.0
+    agreements: deque[tuple[float, Agreement]] = field(default_factory=deque)
+    """Those of the latest plan views without a certain motion, each with its time, s."""
     last: tuple[NDArray[np.float64], float] | None = None
     shown_errors: deque[float] = field(default_factory=lambda: deque(maxlen=_WINDOW))
     accelerations: deque[float] = field(default_factory=lambda: deque(maxlen=_ROUGH_SCANS))
@@ -114,6 +121,7 @@ class Verdict(Sink):
         sigma = _sigma(result.output.covariance)
         self._note_outage(result, sigma)
         self._note_motion(result)
+        self._note_misplaced(result)
         self._note_felt(result)
         self._note_window(result, sigma)
         self._note_unobserved(result, step, sigma)
@@ -187,6 +195,27 @@ class Verdict(Sink):
                 "motion",
                 f"at {self._now_s:.1f} s walls and poles show another motion than the estimated one, by "
                 f"{shown.error:.1f} m: the scan match follows the scan lines, or the map is wrong",
+            )
+
+    def _note_misplaced(self, result: ScanResult) -> None:
+        """Look whether anything upright stays where it is, in views that show no motion without doubt."""
+        recent = self._seen.agreements
+        if result.shown_motion is not None:
+            recent.clear()
+        if result.agreement is None:
+            return
+        recent.append((self._now_s, result.agreement))
+        cells = sum(one.cells for _, one in recent)
+        while cells - recent[0][1].cells >= _MISPLACED_CELLS:
+            cells -= recent.popleft()[1].cells
+        met = sum(one.met for _, one in recent)
+        if cells >= _MISPLACED_CELLS and met < _MISPLACED_SHARE * cells:
+            self._doubt(
+                "misplaced",
+                f"from {recent[0][0]:.1f} s to {self._now_s:.1f} s nothing that stands upright is where the "
+                "estimated motion puts it: the scan match follows the scan lines, or all that stands there "
+                "moves",
+                recent[0][0],
             )
 
     def _note_window(self, result: ScanResult, sigma: float | None) -> None:

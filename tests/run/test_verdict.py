@@ -12,7 +12,7 @@ from lio_jax.data.detect import open_sequence
 from lio_jax.run.felt_motion import FeltMotion
 from lio_jax.run.run import settings_for
 from lio_jax.run.scan_inputs import padded
-from lio_jax.run.shown_motion import MotionCheck, ShownMotion
+from lio_jax.run.shown_motion import Agreement, MotionCheck, ShownMotion
 from lio_jax.run.verdict import Verdict, in_words
 from lio_jax.settings.settings import recipe_settings
 from lio_jax.sim.sequence import SimulatedSequence
@@ -206,6 +206,55 @@ def test_plan_views_are_compared_at_any_speed():
     late = [one for index, one in shown.items() if index > 120]
     assert late
     assert all(one.error < 0.5 and one.way > 3 for one in late)
+
+
+@needs_shared
+@pytest.mark.parametrize("stands", [True, False])
+def test_near_scans_whose_upright_things_are_not_where_the_estimate_puts_them(stands):
+    sequence = open_sequence(DRIVE)
+    settings, results = tracked(road("street", 25.0, 0.0, 8), "default")
+    lidar = settings_for(sequence, recipe_settings("default"))[0].config.lidar
+    truth, check, onwards = sequence.truth(), MotionCheck(), []
+    for index, scan in enumerate(sequence.scans(0, 40)):
+        near = np.linalg.norm(scan.points, axis=1) < 12
+        fields = ("points", "time", "ring", "intensity")
+        scan = replace(scan, **{name: getattr(scan, name)[near] for name in fields})
+        pose = np.eye(4) if stands else truth.at(np.array([scan.end_ns])).poses[0] @ sequence.info.T_imu_lidar
+        look = check(index, padded(scan, None, lidar), pose, lost=False)
+        onwards.append(
+            replace(
+                moved(results[-1], index + 1, 0.0),
+                shown_motion=look.shown,
+                motion_is_hidden=look.is_hidden,
+                agreement=look.agreement,
+            )
+        )
+    reasons = " ".join(verdict_of(settings, [*results, *onwards])["reasons"])
+    assert ("nothing that stands upright is where" in reasons) == stands
+
+
+@pytest.mark.parametrize(
+    ("agreements", "is_doubted"),
+    [
+        ([(20, 1), (20, 1)], True),
+        ([(20, 1), (19, 1)], False),
+        ([(20, 1), (20, 4)], False),
+        # what was right before does not hide it
+        ([(50, 45), (50, 45), (25, 1), (25, 1)], True),
+        # a motion that is shown in between begins anew
+        ([(20, 1), None, (20, 1)], False),
+    ],
+)
+def test_upright_things_count_over_several_views(agreements, is_doubted):
+    settings, results = tracked(road("street", 25.0, 0.0, 8), "default")
+    onwards = [moved(results[-1], number, 2.5 * number) for number in range(1, len(agreements) + 1)]
+    for number, one in enumerate(agreements):
+        if one is None:
+            onwards[number] = replace(onwards[number], shown_motion=ShownMotion(0.0, 7.5, 0.0, 3))
+        else:
+            onwards[number] = replace(onwards[number], motion_is_hidden=True, agreement=Agreement(*one))
+    reasons = " ".join(verdict_of(settings, [*results, *onwards])["reasons"])
+    assert ("nothing that stands upright is where" in reasons) == is_doubted
 
 
 LONG = [pytest.param(name, marks=pytest.mark.long) for name in ("lio_sam", "loam")]
