@@ -1,5 +1,6 @@
 """Text tables with one record a line: names of the columns, then numbers."""
 
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,6 +9,8 @@ from numpy.typing import NDArray
 
 from lio_jax.core.errors import LioJaxError
 from lio_jax.core.files import read_text
+
+_SEPARATOR = re.compile(r"\s*,\s*|\s+")
 
 
 class TextTable(NamedTuple):
@@ -38,11 +41,8 @@ def read_text_table(path: Path, content: str, remedy: str) -> TextTable:
         LioJaxError: the file is no text, holds no row, or a row has another number of columns or a word that
             is no number.
     """
-    lines = [
-        (number, _words(line))
-        for number, line in enumerate(read_text(path, remedy).splitlines(), 1)
-        if line.strip()
-    ]
+    text = enumerate(read_text(path, remedy).splitlines(), 1)
+    lines = [(number, _words(line)) for number, line in text if line.strip()]
     names: list[str] | None = None
     while lines and _number(lines[0][1][0]) is None:
         names = lines.pop(0)[1]
@@ -60,7 +60,10 @@ def read_text_table(path: Path, content: str, remedy: str) -> TextTable:
 
 def _words(line: str) -> list[str]:
     line = line.strip().lstrip("#%").strip()
-    return [word.strip() for word in (line.split(",") if "," in line else line.split())] or [""]
+    words = _SEPARATOR.split(line.rstrip(", \t"))
+    # a name may contain blanks: "w_RS_S_x [rad s^-1]"
+    is_named = _number(words[0]) is None and "," in line
+    return [word.strip() for word in line.split(",")] if is_named else words
 
 
 def _number(word: str) -> float | None:

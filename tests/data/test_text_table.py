@@ -16,7 +16,8 @@ def _read(folder: Path, text: str) -> TextTable:
 
 
 @pytest.mark.parametrize(
-    "text", ["1 2\n3 4\n", "1, 2\n\n3,4", "# a comment\n#t, x\n1\t2\n3 4\n", "% t x\n1 2\n3 4"]
+    "text",
+    ["1 2\n3 4\n", "1, 2\n\n3,4", "# a comment\n#t, x\n1\t2\n3 4\n", "% t x\n1 2\n3 4", "1,2,\n3 ,4,\n"],
 )
 def test_numbers_of_all_separators(tmp_path: Path, text: str) -> None:
     """Commas, tabs, blanks, empty lines and comments before the numbers do not change the numbers."""
@@ -30,6 +31,11 @@ def test_names_and_places(tmp_path: Path) -> None:
     assert table.line_numbers == [4]
     assert table.words[0][0] == "1700000000123456789"
     assert np.isnan(table.values[0, 1])
+
+
+def test_rows_with_both_separators(tmp_path: Path) -> None:
+    """A comma behind the time alone does not hide the columns after it."""
+    np.testing.assert_array_equal(_read(tmp_path, "t, x\n1, 2 3\n4, 5 6\n").values, [[1, 2, 3], [4, 5, 6]])
 
 
 def test_no_names(tmp_path: Path) -> None:
